@@ -89,8 +89,8 @@ def measured(
         inside = true_inside(replace(camera, cam_from_world=truth.camera_pose(camera.cam_from_world)), surface)
         render = run.picture(camera)
         errors = np.square((render.astype(np.float64) - photo) / 255.0).mean(axis=2)
-        counted = np.ones(inside.shape, np.bool_) if mask is None else mask
-        parts = [rows & counted for rows in (inside, ~inside)]
+        valid = np.ones(inside.shape, np.bool_) if mask is None else mask
+        parts = [rows & valid for rows in (inside, ~inside)]
         found[view.camera.name] = (
             np.array([errors[rows].sum() for rows in parts]),
             np.array([rows.sum() for rows in parts], np.float64),

@@ -179,15 +179,15 @@ def measure_scales(run: OpenedRun, others: dict[str, OpenedRun], names: Sequence
         row |= {"pixels": f"{camera.width}x{camera.height}"} | mean_measures(
             [_measured(run, *v) for v in views.values()]
         )
-        shown = [views[trained.name][1], run.picture(camera)]
+        pictures = [views[trained.name][1], run.picture(camera)]
         if size in others:
             other = others[size]
             figures = mean_measures([_measured(other, *view) for view in views.values()])
             row |= {f"other_{key}": value for key, value in figures.items()}
             own = other.camera(next(view for view in other.views if view.camera.name == trained.name))
             row |= {"other_pixels": f"{own.width}x{own.height}", "below": row["other_psnr"] - row["psnr"]}
-            shown.append(other.picture(camera))
-        write_png(folder / f"{Path(trained.name).stem}.{size}.png", np.hstack(shown))
+            pictures.append(other.picture(camera))
+        write_png(folder / f"{Path(trained.name).stem}.{size}.png", np.hstack(pictures))
         rows.append(row)
     return rows
 

@@ -132,9 +132,9 @@ def write_subtitles(path: Path, flight: Flight) -> None:
         east, north, up = flight.centre(float(second)) + generator.normal(0.0, RECEIVER_M, 3)
         latitude = LATITUDE + north / METRES_PER_DEGREE
         longitude = LONGITUDE + east / (METRES_PER_DEGREE * math.cos(math.radians(LATITUDE)))
-        shown = [f"00:{at // 60:02d}:{at % 60:02d},000" for at in (second, second + 1)]
+        times = [f"00:{at // 60:02d}:{at % 60:02d},000" for at in (second, second + 1)]
         cues.append(
-            f"{second + 1}\n{shown[0]} --> {shown[1]}\n2026-06-18 13:{second // 60:02d}:{second % 60:02d}.000\n"
+            f"{second + 1}\n{times[0]} --> {times[1]}\n2026-06-18 13:{second // 60:02d}:{second % 60:02d}.000\n"
             f"[latitude: {latitude:.7f}] [longitude: {longitude:.7f}] "
             f"[rel_alt: {up:.3f} abs_alt: {HEIGHT_M + up:.3f}]\n"
         )

@@ -138,8 +138,8 @@ def _see(
     )  # far outside, the distortion polynomial turns back
     near, local = near[inside], local[inside]
     places = np.asarray(lens().img_from_cam(local)) + rng.normal(0.0, NOISE_PX, (len(local), 2))
-    shown = (places > 0.0).all(axis=1) & (places < [WIDTH, HEIGHT]).all(axis=1) & (rng.random(len(local)) < DETECTED)
-    order = rng.permutation(np.flatnonzero(shown))  # the keypoints' order must not help mapping
+    visible = (places > 0.0).all(axis=1) & (places < [WIDTH, HEIGHT]).all(axis=1) & (rng.random(len(local)) < DETECTED)
+    order = rng.permutation(np.flatnonzero(visible))  # the keypoints' order must not help mapping
     return near[order], places[order]
 
 

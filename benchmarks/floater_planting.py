@@ -196,5 +196,5 @@ def _stands(found: Gaussians, view: FloaterView, options: rasterizer.RenderOptio
     with np.errstate(invalid="ignore"):
         clear = view.gaps(means) > np.minimum(reach, 0.5)
     splats = project(found, view.camera, options)
-    shown = splats.usable & (splats.opacities >= SEEN_ALPHA)
-    return np.asarray(clear & shown.numpy() & (depth > 0.0))
+    visible = splats.usable & (splats.opacities >= SEEN_ALPHA)
+    return np.asarray(clear & visible.numpy() & (depth > 0.0))

@@ -194,7 +194,7 @@ def run_entry(part: GpuPart, file: VisitFile) -> int:
     try:
         for row in getattr(importlib.import_module(module), function)(**part.arguments):
             file.write({"part": part.name, "row": row})
-            print("   " + shown(row), flush=True)
+            print("   " + row_text(row), flush=True)
     except Refusal as error:
         print(f"refused: {error}", flush=True)
         return REFUSED
@@ -264,7 +264,7 @@ def _taken(running: list[PartProcess]) -> Iterator[PartProcess]:
         yield running.pop(0)
 
 
-def shown(row: Row) -> str:
+def row_text(row: Row) -> str:
     """Return a row as one line of text."""
     texts = {key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in row.items()}
     return "  ".join(f"{key} {text}" for key, text in texts.items())

@@ -109,12 +109,12 @@ def verdicts(record: VisitRecord) -> Iterator[Verdict]:
     yield as_the_cpu(record)
 
 
-def judged(demand: str, values: Sequence[float], holds: object, shown: str, worst: object) -> Verdict:
+def judged(demand: str, values: Sequence[float], holds: object, number_format: str, worst: object) -> Verdict:
     """Return the verdict of the worst of some values; NaN does not hold."""
     if not values:
         return Verdict(demand, "", UNKNOWN)
     value = math.nan if any(math.isnan(each) for each in values) else worst(values)
-    return Verdict(demand, shown.format(value), HOLDS if holds(value) else FAILS)
+    return Verdict(demand, number_format.format(value), HOLDS if holds(value) else FAILS)
 
 
 def passed(record: VisitRecord, part: str, demand: str) -> Verdict:

@@ -127,7 +127,7 @@ class SceneClearance:
         self.seen = [points.xyz[tracks[camera.name]] for camera in cameras]
         self.medians = [_median(run.median_depth(camera)) for camera in cameras]
 
-    def look(self, frame: PathFrame, index: int) -> Row:
+    def clearance_row(self, frame: PathFrame, index: int) -> Row:
         """Return how near a frame's content is, between photo ``index`` and the next."""
         points = np.vstack(self.seen[index : index + 2])
         _, _, z = frame.camera.in_view(points)
@@ -191,7 +191,7 @@ def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder:
         row: Row = {"frame": number, "between": names, "luminance": float((frame.pixels @ LUMA).mean())}
         if before is not None:
             row |= {"step": row["luminance"] - rows[-1]["luminance"]} | change(before, frame)
-        rows.append(row | surroundings.look(frame, index))
+        rows.append(row | surroundings.clearance_row(frame, index))
         write_png(folder / f"frame_{number:04d}.png", frame.pixels)
         height = max(1, round(SHEET_WIDTH * camera.height / camera.width))
         small.append(np.asarray(cv2.resize(frame.pixels, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)))

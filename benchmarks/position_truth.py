@@ -106,8 +106,8 @@ def told_noise(scene: Scene) -> PositionObservations:
     share = (DRIFT_M**2 / size**2)[[0, 2]]
     noise = as_stated(positions)
     drifts = np.tile(share, (len(noise.classes), 1)), np.full_like(factors, DRIFT)
-    told = PositionNoise(noise.classes, noise.of, factors, factors, *drifts)
-    return replace(told.observations(positions), offset_sigmas=COMMON_M[None])
+    stated_noise = PositionNoise(noise.classes, noise.of, factors, factors, *drifts)
+    return replace(stated_noise.observations(positions), offset_sigmas=COMMON_M[None])
 
 
 def with_control(block: Block, scene: Scene, places: tuple[tuple[float, float], ...], seed: int) -> Block:

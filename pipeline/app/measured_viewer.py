@@ -43,10 +43,10 @@ def update_viewer(out: Path) -> str:
     pages = [name for name in own if (out / name).is_file()]
     if not pages or not has_measurements(out):
         return ""
-    shown, trouble = shown_measurements(out), ""
+    measurements, trouble = displayed_measurements(out), ""
     for name in pages:
         try:
-            _update(out / name, shown)
+            _update(out / name, measurements)
         except ValueError:
             trouble = (
                 f"{name} was written by an earlier version and cannot show measurements; update it with: "
@@ -55,10 +55,10 @@ def update_viewer(out: Path) -> str:
     return trouble
 
 
-def _update(path: Path, shown: Mapping[str, Any] | None) -> None:
+def _update(path: Path, measurements: Mapping[str, Any] | None) -> None:
     """Put measurements into a page without changing its mtime; a page that already shows them is left alone."""
     page = path.read_bytes()
-    updated = with_measurements(page, shown)
+    updated = with_measurements(page, measurements)
     if updated == page:
         return
     stamp = path.stat()
@@ -71,7 +71,7 @@ def _update(path: Path, shown: Mapping[str, Any] | None) -> None:
     write_durably(path, fill)
 
 
-def shown_measurements(out: Path) -> dict[str, Any] | None:
+def displayed_measurements(out: Path) -> dict[str, Any] | None:
     """The measurements to show: those of the current surface model, in the page's frame. None if there are none."""
     from splatpipe.stages.line import DSM, EXPORT, LINE  # here: every run ends in this module, whatever its pipeline
 

@@ -58,8 +58,8 @@ class PathLabels:
         if "/" not in text and "\\" not in text:
             return text
         for path, name in self.names:
-            shown = rf"{_escape_backslashes(name)}\1" if name else ""
-            text = re.sub(rf"(?<![\w.-]){re.escape(path)}(?![\w-])(/?)", shown, text)
+            replacement = rf"{_escape_backslashes(name)}\1" if name else ""
+            text = re.sub(rf"(?<![\w.-]){re.escape(path)}(?![\w-])(/?)", replacement, text)
         return _ELSEWHERE.sub("", text)
 
     def plain_value(self, value: Any) -> Any:

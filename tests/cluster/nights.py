@@ -237,8 +237,8 @@ def compare_with_local(night: Night) -> None:
     for name in ("house", "barn"):
         gaps = overhead(batch.out / name / "events.jsonl")
         jobs, engine_s = night.between_jobs(batch, name)
-        told = f"{name}: {len(gaps)} stages in {jobs} jobs, {sum(gaps.values()):.0f} s between the stages"
-        night.say(f"{told}, of which {engine_s:.0f} s from a job's end to the next one's start")
+        summary = f"{name}: {len(gaps)} stages in {jobs} jobs, {sum(gaps.values()):.0f} s between the stages"
+        night.say(f"{summary}, of which {engine_s:.0f} s from a job's end to the next one's start")
         if engine_s > MAX_OVERHEAD_S:
             raise Problem(f"More than {MAX_OVERHEAD_S:.0f} s pass between the jobs of {name}.")
 

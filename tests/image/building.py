@@ -167,8 +167,8 @@ def _make_slim(folder: Path) -> None:
     """Leave out of a base, and of packages installed on it later, what Debian's slim images leave out."""
     (folder / "etc" / "dpkg" / "dpkg.cfg.d" / "slim").write_text(DPKG_SLIM, encoding="utf-8")
     (folder / "etc" / "apt" / "apt.conf.d" / "clean").write_text(APT_CLEAN, encoding="utf-8")
-    for unwanted in OMITTED_FOLDERS:
-        for path in (folder / unwanted).rglob("*"):
+    for omitted in OMITTED_FOLDERS:
+        for path in (folder / omitted).rglob("*"):
             if not path.is_dir() and path.name != "copyright":
                 path.unlink()
     for cache in (folder / "var" / "cache" / "apt").glob("*.bin"):

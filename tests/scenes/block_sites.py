@@ -62,15 +62,15 @@ class Kill(BaseException):
     """Stands in for a kill."""
 
 
-def step_with(patch: pytest.MonkeyPatch, look: Callable[[TrainState, TrainingPhoto], None]) -> None:
-    """Call ``look`` before each iteration."""
+def step_with(patch: pytest.MonkeyPatch, observe: Callable[[TrainState, TrainingPhoto], None]) -> None:
+    """Call ``observe`` before each iteration."""
     step = loop.iterate
 
-    def looking(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
-        look(state, photo)
+    def observed_iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
+        observe(state, photo)
         step(state, plan, photo)
 
-    patch.setattr(loop, "iterate", looking)
+    patch.setattr(loop, "iterate", observed_iterate)
 
 
 def coverages_of(site: SiteParts) -> list[PhotoCoverage]:

@@ -86,8 +86,8 @@ def observed(
     for view in cameras:
         rows, pixels, depths = view.in_view(xyz)
         columns, lines = pixels.astype(int).T
-        shown = render_depth(coarse, view, OPTIONS)[lines, columns]
-        found.append(rows[depths < shown + 0.5])
+        rendered_depth = render_depth(coarse, view, OPTIONS)[lines, columns]
+        found.append(rows[depths < rendered_depth + 0.5])
     return found
 
 

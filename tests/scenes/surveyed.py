@@ -82,11 +82,11 @@ def true_model(
         facing = ((np.array(truth["centre_m"]) - places) * normals).sum(axis=1) > 0.0
         pixels = np.asarray(camera.img_from_cam(seen))
         inside = (pixels > 0.0).all(axis=1) & (pixels < [WIDTH, HEIGHT]).all(axis=1) & (seen[:, 2] > 1.0)
-        shown = np.flatnonzero(facing & inside)
-        noisy = pixels[shown] + rng.normal(size=(len(shown), 2)) * FEATURE_PX
+        visible = np.flatnonzero(facing & inside)
+        noisy = pixels[visible] + rng.normal(size=(len(visible), 2)) * FEATURE_PX
         image = pycolmap.Image(truth["name"], noisy, 1, number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-        for k, point in enumerate(shown.tolist()):
+        for k, point in enumerate(visible.tolist()):
             tracks[point].append(pycolmap.TrackElement(number, k))
     for place, track in zip(places, tracks, strict=True):
         if len(track) >= 2:

@@ -237,7 +237,7 @@ def _ending(code: int, output: bytes, events: Path) -> AttemptResult:
 def _may_be_temporary(events: Path) -> bool:
     """Whether the failure may be temporary: photos changed or were briefly unavailable, as on a network disk."""
     culprit = read_history(events, running=False).culprit
-    return culprit is not None and culprit.state == "failed" and not culprit.lasting
+    return culprit is not None and culprit.state == "failed" and not culprit.permanent
 
 
 def _error_of(output: bytes) -> Mapping[str, JSON]:

@@ -68,14 +68,14 @@ def frame_of(preflight: Preflight) -> MapFrame | None:
     if not cameras:
         return None
     reach = REACH_SHARE * max(_span(cameras, 0), _span(cameras, 1), MIN_SPAN_M)
-    shown: list[Place] = [place for photo in preflight.photos for place in photo.footprint_m or ()]
-    shown += [place for gap in preflight.gaps for place in gap.outline_m]
+    content: list[Place] = [place for photo in preflight.photos for place in photo.footprint_m or ()]
+    content += [place for gap in preflight.gaps for place in gap.outline_m]
     low, high = ([bound(place[axis] for place in cameras) for axis in (0, 1)] for bound in (min, max))
     for point in (point.position_m for point in preflight.control):
         if all(low[axis] - reach <= point[axis] <= high[axis] + reach for axis in (0, 1)):
-            shown.append(point)
+            content.append(point)
     for axis in (0, 1):
-        near = [min(max(place[axis], low[axis] - reach), high[axis] + reach) for place in shown]
+        near = [min(max(place[axis], low[axis] - reach), high[axis] + reach) for place in content]
         low[axis], high[axis] = min([low[axis], *near]), max([high[axis], *near])
     east, north = (high[0] + low[0]) / 2, (high[1] + low[1]) / 2
     margin = MARGIN_SHARE * max(high[0] - low[0], high[1] - low[1], MIN_SPAN_M)

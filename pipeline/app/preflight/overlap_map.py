@@ -179,17 +179,17 @@ def _pairs(pairs: Sequence[MatchedPair], places: Mapping[int, tuple[int, int]], 
 
 def _strongest(pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
     """The pairs to draw, weakest first; if there are too many, each photo's strongest have priority."""
-    ranked = sorted(pairs, key=lambda pair: (-pair.matches, pair.first, pair.second))
-    if len(ranked) > MAX_PAIRS:
+    strongest_first = sorted(pairs, key=lambda pair: (-pair.matches, pair.first, pair.second))
+    if len(strongest_first) > MAX_PAIRS:
         held: dict[int, int] = {}
         needed = []  # for each pair, the smaller number of lines so far of its two photos
-        for pair in ranked:
+        for pair in strongest_first:
             needed.append(min(held.get(pair.first, 0), held.get(pair.second, 0)))
             for photo in (pair.first, pair.second):
                 held[photo] = held.get(photo, 0) + 1
-        order = sorted(range(len(ranked)), key=lambda i: (needed[i], i))
-        ranked = [ranked[i] for i in order[:MAX_PAIRS]]
-    return sorted(ranked, key=lambda pair: (pair.matches, pair.first, pair.second))
+        order = sorted(range(len(strongest_first)), key=lambda i: (needed[i], i))
+        strongest_first = [strongest_first[i] for i in order[:MAX_PAIRS]]
+    return sorted(strongest_first, key=lambda pair: (pair.matches, pair.first, pair.second))
 
 
 def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtful: Mapping[str, str]) -> str:

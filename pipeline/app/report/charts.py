@@ -83,9 +83,14 @@ def overlap_map(overlap: OverlapGrid, unit: str) -> Markup:
     """Map of the number of footprints that cover each place."""
     figure, axes = new_figure(*map_size(overlap.box), right=1.15)
     norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
-    shown = np.ma.masked_equal(overlap.counts, 0)
+    covered_counts = np.ma.masked_equal(overlap.counts, 0)
     axes.imshow(
-        shown, extent=overlap.box, cmap=ListedColormap(OVERLAP_COLOURS), norm=norm, interpolation="nearest", zorder=1
+        covered_counts,
+        extent=overlap.box,
+        cmap=ListedColormap(OVERLAP_COLOURS),
+        norm=norm,
+        interpolation="nearest",
+        zorder=1,
     )
     labels = ["1", "2", "3", "4", "5–6", "7–9", "10 or more"]
     for colour, label in zip(OVERLAP_COLOURS, labels, strict=True):

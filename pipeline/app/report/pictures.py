@@ -92,7 +92,7 @@ def chosen_views(views: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return [*views[: MAX_VIEWS - 1], views[-1]]
 
 
-def cut_chips(
+def cut_crops(
     points: Sequence[Mapping[str, Any]], photos_part: Path | None, photos_dir: Path | None
 ) -> dict[tuple[int, int], PhotoCrop]:
     """Make a crop for each observation of the surveyed points.
@@ -109,7 +109,7 @@ def cut_chips(
     by_photo: dict[str, list[tuple[int, int]]] = {}
     for place in _worst_first(points)[:MAX_CROPS]:
         by_photo.setdefault(str(points[place[0]]["observations"][place[1]]["photo"]), []).append(place)
-    chips: dict[tuple[int, int], PhotoCrop] = {}
+    crops: dict[tuple[int, int], PhotoCrop] = {}
     decoded = 0
     for name, places in by_photo.items():  # the photos with the worst marks first
         photo, pixels = photos.get(name), None
@@ -120,8 +120,8 @@ def cut_chips(
             pixels = _decoded(photo, photos_part, photos_dir)
         for place in places:
             seen = points[place[0]]["observations"][place[1]]
-            chips[place] = _chip(seen, pixels, 1 if photo is None else photo.orientation)
-    return chips
+            crops[place] = _mark_crop(seen, pixels, 1 if photo is None else photo.orientation)
+    return crops
 
 
 def double_crops(
@@ -176,11 +176,11 @@ def _decoded(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h
 
 def _worst_first(points: Sequence[Mapping[str, Any]]) -> list[tuple[int, int]]:
     """Every point's worst observation, then every point's second worst, and so on."""
-    ranked = []
+    by_rank = []
     for i, point in enumerate(points):
         sizes = [(-_size(seen), j) for j, seen in enumerate(point.get("observations", []))]
-        ranked += [(rank, i, j) for rank, (_, j) in enumerate(sorted(sizes))]
-    return [(i, j) for _, i, j in sorted(ranked)]
+        by_rank += [(rank, i, j) for rank, (_, j) in enumerate(sorted(sizes))]
+    return [(i, j) for _, i, j in sorted(by_rank)]
 
 
 def _size(seen: Mapping[str, Any]) -> float:
@@ -188,7 +188,7 @@ def _size(seen: Mapping[str, Any]) -> float:
     return float(np.hypot(*residual)) if residual else 0.0
 
 
-def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, orientation: int) -> PhotoCrop:
+def _mark_crop(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, orientation: int) -> PhotoCrop:
     mark = np.array(seen["pixel"], np.float64)
     residual = seen.get("residual_px")
     side = CROP_SIDE_PX

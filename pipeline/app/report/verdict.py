@@ -211,10 +211,10 @@ def _camera_reasons(inputs: ReportInputs) -> list[Mapping[str, Any]]:
     if not any(_is_focal_doubt(reason) for reason in reasons):
         return reasons
     try:
-        settled = _has_adopted_focals(inputs) and max(_focal_deviations(inputs), default=1.0) <= FOCAL_GOOD
+        focals_agree = _has_adopted_focals(inputs) and max(_focal_deviations(inputs), default=1.0) <= FOCAL_GOOD
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        settled = False
-    return [reason for reason in reasons if not (settled and _is_focal_doubt(reason))]
+        focals_agree = False
+    return [reason for reason in reasons if not (focals_agree and _is_focal_doubt(reason))]
 
 
 def _mapping_reasons(inputs: ReportInputs) -> list[Mapping[str, Any]]:

@@ -278,17 +278,23 @@ class Projector:
             ahead = np.flatnonzero(np.isfinite(seen).all(axis=1) & (seen[:, 2] > 0.0))
             if len(ahead) == 0:
                 continue
-            shown = np.asarray(view.camera.img_from_cam(seen[ahead]), np.float64).reshape(-1, 2)
-            back = np.asarray(view.camera.cam_from_img(shown), np.float64).reshape(-1, 2)
+            projected = np.asarray(view.camera.img_from_cam(seen[ahead]), np.float64).reshape(-1, 2)
+            back = np.asarray(view.camera.cam_from_img(projected), np.float64).reshape(-1, 2)
             true = np.abs(back - seen[ahead, :2] / seen[ahead, 2:]).max(axis=1) < RAY_TOLERANCE
-            shown = shown / view.scale
+            projected = projected / view.scale
             focal = view.camera.mean_focal_length() / view.scale
             spread = np.maximum(MIN_RADIUS_PX, focal * radius_m[ahead] / seen[ahead, 2])
             margin = np.minimum(spread, 0.25 * photo.width)[:, None]
-            inside = true & ((shown >= -margin) & (shown <= np.array([photo.width, photo.height]) + margin)).all(axis=1)
+            inside = true & (
+                (projected >= -margin) & (projected <= np.array([photo.width, photo.height]) + margin)
+            ).all(axis=1)
             rows = ahead[inside]
-            pixels[rows, index], radius[rows, index], depth[rows, index] = shown[inside], spread[inside], seen[rows, 2]
-            beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)
+            pixels[rows, index], radius[rows, index], depth[rows, index] = (
+                projected[inside],
+                spread[inside],
+                seen[rows, 2],
+            )
+            beyond = ((projected[inside] < 0.0) | (projected[inside] > [photo.width, photo.height])).any(axis=1)
             doubtful[rows, index] = beyond | ~witnessed[rows, index]
         return Projection(pixels, radius, depth, doubtful)
 

@@ -125,8 +125,8 @@ def _read_json(run: RunFolder, name: str) -> Mapping[str, JSON]:
 
 def _file(run: RunFolder, name: str) -> dict[str, Any]:
     size = (run.out / name).lstat().st_size
-    shown = PurePosixPath(name).suffix in BROWSER_SUFFIXES
-    return {"name": name, "size": _bytes(size), "text": WHAT.get(name, ""), "shown": shown}
+    in_browser = PurePosixPath(name).suffix in BROWSER_SUFFIXES
+    return {"name": name, "size": _bytes(size), "text": WHAT.get(name, ""), "shown": in_browser}
 
 
 def _bytes(size: int) -> str:

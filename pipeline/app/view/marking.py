@@ -199,13 +199,13 @@ class Marking:
             marks, found = self._text.marks.get(name, {}), self._detections().get(name, {})
             hidden = self._text.hidden
         number = list(self._points).index(name)
-        shown = {s.photo: s for s in estimate.survey.points[number].sightings}
+        sighting_by_photo = {s.photo: s for s in estimate.survey.points[number].sightings}
         index = {photo: k for k, photo in enumerate(self.job.model.names)}
         lines = self._lines(estimate, number)
         rows = []
         for photo in self._photos:
             row = self._photo_row(photo, index.get(photo), number, projection)
-            sighting = shown.get(photo)
+            sighting = sighting_by_photo.get(photo)
             off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
             mark = self._shift_pixel(marks[photo]) if photo in marks else found.get(photo)
             row |= {
@@ -330,8 +330,8 @@ def helpful_order(
 
 def _visible_part(line: Float64[np.ndarray, "steps 2"]) -> list[list[float]] | None:
     """The part of a line within the photo."""
-    shown = line[np.isfinite(line).all(axis=1)]
-    return np.round(shown, 1).tolist() if len(shown) > 1 else None
+    visible = line[np.isfinite(line).all(axis=1)]
+    return np.round(visible, 1).tolist() if len(visible) > 1 else None
 
 
 def _coordinates(point: SurveyedPoint) -> list[float | None]:

@@ -40,29 +40,29 @@ class Elevation:
 
     Attributes:
         wall: The wall.
-        sheet: Its frame: x from the wall's left end, y up as in the local frame, z towards the viewer, metres.
+        plane: Its frame: x from the wall's left end, y up as in the local frame, z towards the viewer, metres.
         depth: Metres in front of the plane, NaN where unknown.
         sigma: Expected deviation of each depth, metres.
         colour: Red, green, blue, alpha: 0 where there is no colour.
     """
 
     wall: Wall
-    sheet: RasterPlane
+    plane: RasterPlane
     depth: Float32[np.ndarray, "h w"]
     sigma: Float32[np.ndarray, "h w"]
     colour: UInt8[np.ndarray, "h w 4"]
 
     def corners(self) -> Float64[np.ndarray, "4 3"]:
         """Upper left, upper right, lower right, lower left of the raster, in the plane; local metres."""
-        lattice = self.sheet.lattice
+        lattice = self.plane.lattice
         left, top = lattice.east_m, lattice.north_m
         right, bottom = left + lattice.width * lattice.cell_m, top - lattice.height * lattice.cell_m
-        return self.sheet.local_from_sheet(
+        return self.plane.local_from_plane(
             np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]])
         )
 
 
-def wall_sheet(wall: Wall, cell_m: float) -> RasterPlane:
+def wall_plane(wall: Wall, cell_m: float) -> RasterPlane:
     """The sheet of a wall: whole cells from end to end and from top to foot, with any excess split between both sides.
 
     Args:
@@ -112,33 +112,33 @@ def draw_elevation(wall: Wall, cell_m: float, photos: ElevationPhotos, progress:
         progress: Called with the number of finished tiles and of all tiles.
 
     Raises:
-        SplatpipeError: as ``wall_sheet``.
+        SplatpipeError: as ``wall_plane``.
     """
-    sheet = wall_sheet(wall, cell_m)
-    depths_tiles, colour_tiles = (list(sheet.lattice.tiles(side)) for side in (HEIGHTS_TILE, TILE))
+    plane = wall_plane(wall, cell_m)
+    depths_tiles, colour_tiles = (list(plane.lattice.tiles(side)) for side in (HEIGHTS_TILE, TILE))
     total = len(depths_tiles) + len(colour_tiles)
-    sources, levels = _photos_in_front(sheet, photos)
-    shape = sheet.lattice.height, sheet.lattice.width
+    sources, levels = _photos_in_front(plane, photos)
+    shape = plane.lattice.height, plane.lattice.width
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     colour = np.zeros((*shape, 4), np.uint8)
     cache: LruCache[PosedDepthMap] = LruCache(CACHE_BYTES)
     known = [source.depths for source in sources if source.depths is not None]
-    capture = HeightInput(known, sheet.lattice, sheet.relief, cache, upright=True)
+    capture = HeightInput(known, plane.lattice, plane.relief, cache, upright=True)
     for done, part in enumerate(surface_heights(capture, depths_tiles, photos.threads), 1):
         cut = part.tile.slices
         depth[cut], sigma[cut] = part.height, part.sigma
         progress(done, total)
     depth = remove_specks(depth)
-    surface = HeightField(sheet.lattice, depth)
+    surface = HeightField(plane.lattice, depth)
     album = OrthoInput(
-        sources, surface, sheet.lattice, sheet.relief, levels, LruCache(CACHE_BYTES), LruCache(CACHE_BYTES)
+        sources, surface, plane.lattice, plane.relief, levels, LruCache(CACHE_BYTES), LruCache(CACHE_BYTES)
     )
     for done, drawn in enumerate(orthophotos(album, colour_tiles, photos.threads), len(depths_tiles) + 1):
         cut = drawn.tile.slices
         colour[(*cut, slice(0, 3))] = drawn.colour
         colour[(*cut, 3)] = np.where(drawn.known, np.uint8(255), np.uint8(0))
         progress(done, total)
-    return Elevation(wall, sheet, depth, sigma, colour)
+    return Elevation(wall, plane, depth, sigma, colour)
 
 
 def remove_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -155,11 +155,11 @@ def remove_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
     return result
 
 
-def _photos_in_front(sheet: RasterPlane, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
+def _photos_in_front(plane: RasterPlane, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
     """Photos in front of a wall, in its sheet's frame, with their exposure gains."""
     rows = [
         row
         for row, source in enumerate(photos.sources)
-        if sheet.sheet_from_local(source.camera.centre())[2] > sheet.relief.high_m
+        if plane.plane_from_local(source.camera.centre())[2] > plane.relief.high_m
     ]
-    return [sheet.transform_photo(photos.sources[row]) for row in rows], photos.levels.of(rows)
+    return [plane.transform_photo(photos.sources[row]) for row in rows], photos.levels.of(rows)

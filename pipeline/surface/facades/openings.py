@@ -22,27 +22,27 @@ SQUARE = 0.8  # share of its level rectangle that an opening fills to be drawn a
 Ring = Float64[np.ndarray, "_ 2"]
 
 
-def recesses(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
+def recesses(depth: Float32[np.ndarray, "h w"], plane: RasterPlane) -> list[Ring]:
     """Outlines of openings (areas behind the plane surrounded by the wall's face) on the sheet, metres."""
-    limit = max(RECESS_M, STEP_GSD * sheet.lattice.cell_m)
+    limit = max(RECESS_M, STEP_GSD * plane.lattice.cell_m)
     face = np.isfinite(depth) & (np.nan_to_num(depth, nan=-np.inf) >= -limit)
-    return _rings(np.nan_to_num(depth, nan=0.0) < -limit, sheet, face)
+    return _rings(np.nan_to_num(depth, nan=0.0) < -limit, plane, face)
 
 
-def projections(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
+def projections(depth: Float32[np.ndarray, "h w"], plane: RasterPlane) -> list[Ring]:
     """Outlines of parts that project from the plane, likewise."""
-    limit = max(JUT_M, STEP_GSD * sheet.lattice.cell_m)
-    return _rings(np.nan_to_num(depth, nan=0.0) > limit, sheet, None)
+    limit = max(JUT_M, STEP_GSD * plane.lattice.cell_m)
+    return _rings(np.nan_to_num(depth, nan=0.0) > limit, plane, None)
 
 
-def outlines(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
+def outlines(depth: Float32[np.ndarray, "h w"], plane: RasterPlane) -> list[Ring]:
     """Outlines of the known wall, with small holes and notches closed."""
     known = np.isfinite(depth).astype(np.uint8)
-    reach = round(BRIDGED_M / sheet.lattice.cell_m)
+    reach = round(BRIDGED_M / plane.lattice.cell_m)
     wide = cv2.copyMakeBorder(known, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
     closed = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _square(reach)))
     height, width = known.shape
-    return _rings(closed[reach : reach + height, reach : reach + width] > 0, sheet, None)
+    return _rings(closed[reach : reach + height, reach : reach + width] > 0, plane, None)
 
 
 def _square(cells: int) -> UInt8[np.ndarray, "k k"]:
@@ -51,16 +51,16 @@ def _square(cells: int) -> UInt8[np.ndarray, "k k"]:
     return np.ones((side, side), np.uint8)
 
 
-def _rings(there: Bool[np.ndarray, "h w"], sheet: RasterPlane, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
+def _rings(there: Bool[np.ndarray, "h w"], plane: RasterPlane, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
     """Outlines of connected parts, along the cells' borders, from the largest.
 
     Args:
         there: Mask to outline.
-        sheet: The sheet with its cells.
+        plane: The sheet with its cells.
         face: The wall's face, which has to surround openings; openings that are nearly level rectangles are drawn as
             such. None if the parts are not openings.
     """
-    cell = sheet.lattice.cell_m
+    cell = plane.lattice.cell_m
     kernel = _square(round(SOFT_M / cell))
     mask = np.asarray(cv2.morphologyEx(there.astype(np.uint8), cv2.MORPH_OPEN, kernel))
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
@@ -76,7 +76,7 @@ def _rings(there: Bool[np.ndarray, "h w"], sheet: RasterPlane, face: Bool[np.nda
             continue
         ring = _level_rectangle(own) if face is not None and own.mean() >= SQUARE else _trace_outline(own)
         columns, rows = (ring + np.array([left, top])).T
-        rings.append(np.column_stack([sheet.lattice.east_m + columns * cell, sheet.lattice.north_m - rows * cell]))
+        rings.append(np.column_stack([plane.lattice.east_m + columns * cell, plane.lattice.north_m - rows * cell]))
     return rings
 
 

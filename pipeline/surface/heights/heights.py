@@ -123,8 +123,8 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MAX_VOTES) -> Hei
     height, new = _fill_holes(capture, wide, agreed, numbers)
     shape = (wide.height, wide.width)
     sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma).reshape(shape)
-    counted = np.where(np.isfinite(agreed), np.minimum(fit.photos, MAX_COUNT), 0)
-    photos, height = np.where(new, 1, counted).reshape(shape), height.reshape(shape)
+    photo_counts = np.where(np.isfinite(agreed), np.minimum(fit.photos, MAX_COUNT), 0)
+    photos, height = np.where(new, 1, photo_counts).reshape(shape), height.reshape(shape)
     inner = tuple(slice(capture.margin, capture.margin + side) for side in (tile.height, tile.width))
     known = np.isfinite(height)
     return Heights(

@@ -25,7 +25,7 @@ from splatpipe.pipeline.app.report import is_current, make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
-from splatpipe.pipeline.app.report.pictures import CROP_SIDE_PX, MAX_CROPS, chosen_views, cut_chips
+from splatpipe.pipeline.app.report.pictures import CROP_SIDE_PX, MAX_CROPS, chosen_views, cut_crops
 from splatpipe.pipeline.app.report.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.verdict import judge
 
@@ -51,10 +51,10 @@ def test_its_ids_are_unique(finished: Path) -> None:
 def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
     inputs = read_report_inputs(finished)
     points = inputs.read("georef.control")["points"]
-    chips = cut_chips(points, inputs.part("ingest.photos"), inputs.photos_dir)
+    crops = cut_crops(points, inputs.part("ingest.photos"), inputs.photos_dir)
     seen = points[0]["observations"][0]
-    chip = chips[0, 0]
-    code = str(chip.picture).split(",")[1]
+    crop = crops[0, 0]
+    code = str(crop.picture).split(",")[1]
     cut = Image.open(io.BytesIO(base64.b64decode(code))).convert("RGB")
     left, top = (math.floor(value - CROP_SIDE_PX / 2) for value in seen["pixel"])
     with Image.open(capture_path() / seen["photo"]) as photo:
@@ -255,9 +255,9 @@ def test_hundreds_of_photos_keep_the_report_small() -> None:
     assert len(chosen_views(views)) == 12 and chosen_views(views)[-1] is views[-1]
     seen = [{"photo": f"{i}.jpg", "pixel": [10.0, 10.0], "residual_px": [i / 100.0, 0.0]} for i in range(400)]
     points = [{"observations": seen}, {"observations": seen}, {"observations": seen[:3]}]
-    chips = cut_chips(points, None, None)
-    assert len(chips) == MAX_CROPS
-    assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(chips) and (0, 0) not in chips
+    crops = cut_crops(points, None, None)
+    assert len(crops) == MAX_CROPS
+    assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(crops) and (0, 0) not in crops
 
 
 def test_no_folder_outside_out_is_named(copy_of_run: Path) -> None:

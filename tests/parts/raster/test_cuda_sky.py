@@ -35,7 +35,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [False, True])
 def test_sky_and_its_gradients_are_those_of_the_cpu(device: torch.device, size: tuple[int, int], masked: bool) -> None:
-    camera = skies.look(heading_deg=160.0, pitch_deg=15.0).scaled(*size)
+    camera = skies.camera_towards(heading_deg=160.0, pitch_deg=15.0).scaled(*size)
     mask = None
     if masked:
         mask = torch.rand(size[1], size[0], generator=torch.Generator().manual_seed(1)) > 0.3

@@ -87,7 +87,7 @@ def trained(scene: Path, out: Path, config: TrainConfig = QUICK, threads: int = 
 def test_sky_begins_with_the_colours_that_the_photos_show(scene: Path) -> None:
     sky = SkyModel.begin(load_views(scene / "dataset"), scene / "dataset", 2)
     assert sky is not None and sky.photos == len(skies.HEADINGS)
-    camera = skies.look(heading_deg=3.0, pitch_deg=8.0)
+    camera = skies.camera_towards(heading_deg=3.0, pitch_deg=8.0)
     photo, truth = skies.trace(camera)
     with torch.no_grad():
         seen = sky.panorama.behind(camera, (0.0, 0.0, 0.0)).numpy()
@@ -128,7 +128,7 @@ def empty_render(camera: Camera) -> Render:
 
 
 def test_constant_sky_is_learnt_in_a_few_steps_and_only_from_pixels_of_the_sky() -> None:
-    camera = skies.look(pitch_deg=30.0).scaled(80, 60)
+    camera = skies.camera_towards(pitch_deg=30.0).scaled(80, 60)
     mask = np.zeros((60, 80), bool)
     mask[:30] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
@@ -146,7 +146,7 @@ def test_constant_sky_is_learnt_in_a_few_steps_and_only_from_pixels_of_the_sky()
 
 
 def test_a_sky_trained_elsewhere_is_rendered_and_unchanged() -> None:
-    camera = skies.look(pitch_deg=30.0).scaled(80, 60)
+    camera = skies.camera_towards(pitch_deg=30.0).scaled(80, 60)
     mask = np.zeros((60, 80), bool)
     mask[:30] = True
     colours = np.random.default_rng(1).random((CELLS, 3), np.float32)
@@ -178,7 +178,7 @@ def test_skies_are_returned_for_the_requested_photos(tmp_path: Path) -> None:
 
 
 def test_away_from_the_sky_only_the_given_colour_shines_through() -> None:
-    camera = skies.look(pitch_deg=30.0)
+    camera = skies.camera_towards(pitch_deg=30.0)
     mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     mask[:60] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
@@ -192,7 +192,7 @@ def test_away_from_the_sky_only_the_given_colour_shines_through() -> None:
 
 
 def test_penalty_is_the_mean_opacity_in_front_of_the_sky() -> None:
-    camera = skies.look()
+    camera = skies.camera_towards()
     mask = np.zeros((skies.HEIGHT, skies.WIDTH), bool)
     mask[:60] = True
     sky = SkyModel(skies.UP, np.full((CELLS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
@@ -203,7 +203,7 @@ def test_penalty_is_the_mean_opacity_in_front_of_the_sky() -> None:
     assert alpha.grad is not None and torch.equal(alpha.grad != 0.0, torch.from_numpy(mask))
     small = sky.seen(camera.scaled(80, 60))
     assert small is not None and small.mask[:15].all() and not small.mask[15:].any()
-    assert sky.seen(skies.look(heading_deg=77.0)) is None
+    assert sky.seen(skies.camera_towards(heading_deg=77.0)) is None
 
 
 def opacity_in_sky(scene: Path, model: Path) -> float:

@@ -157,8 +157,8 @@ def blend_exactly(name: str, depth: bool) -> tuple[Answer, dict[str, Tensor]]:
         depth_sum, square_sum = depth_sum + weight * met_at, square_sum + weight * (met_at - DEPTH_ORIGIN) ** 2
         passes = blended & (left > MEDIAN_TRANSMITTANCE) & (after <= MEDIAN_TRANSMITTANCE)
         centre = leaves["depth"][i].detach()
-        shown = met_at.detach().clamp((1.0 - MEDIAN_SHIFT_MAX) * centre, (1.0 + MEDIAN_SHIFT_MAX) * centre)
-        median = median.where(~passes, shown)
+        limited = met_at.detach().clamp((1.0 - MEDIAN_SHIFT_MAX) * centre, (1.0 + MEDIAN_SHIFT_MAX) * centre)
+        median = median.where(~passes, limited)
         left = torch.where(blended, after, left)
     pictures = {
         "colour": (colour + left * torch.tensor(BACKGROUND)[:, None, None]).permute(1, 2, 0),

@@ -23,7 +23,7 @@ def kernels() -> CudaKernels:
 
 def test_gradients_of_the_nodes_have_the_same_bits_in_every_order_of_threads(kernels: CudaKernels) -> None:
     harness = load(build_on_cpu())
-    camera = skies.look(pitch_deg=15.0).scaled(40, 30)
+    camera = skies.camera_towards(pitch_deg=15.0).scaled(40, 30)
     mask = torch.rand(30, 40, generator=torch.Generator().manual_seed(1)) > 0.3
     found = []
     with use_kernels(kernels):
@@ -36,7 +36,7 @@ def test_gradients_of_the_nodes_have_the_same_bits_in_every_order_of_threads(ker
 
 
 def test_sky_is_trained_as_on_the_cpu(kernels: CudaKernels) -> None:
-    camera = skies.look(pitch_deg=30.0).scaled(40, 30)
+    camera = skies.camera_towards(pitch_deg=30.0).scaled(40, 30)
     mask = np.zeros((30, 40), bool)
     mask[:15] = True
     learnt = []

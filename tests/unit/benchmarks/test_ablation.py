@@ -110,8 +110,8 @@ def test_every_figure_of_a_run_is_kept_whatever_was_measured(tmp_path: Path) -> 
         "floaters.views.pairs": 3,
         "loss": None,
     }
-    (shown,) = comparison.means([row("base", "a", 0, **found)], ["base"])
-    assert shown["free space"] == "0.250000" and "depth off" not in shown and "loss" not in shown
+    (row_text,) = comparison.means([row("base", "a", 0, **found)], ["base"])
+    assert row_text["free space"] == "0.250000" and "depth off" not in row_text and "loss" not in row_text
 
 
 def test_results_survive_a_truncated_line(tmp_path: Path) -> None:

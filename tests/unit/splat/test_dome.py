@@ -48,7 +48,7 @@ def test_dome_shows_the_panorama_without_holes(up: np.ndarray, x: float) -> None
     panorama = coloured_panorama(up)
     dome = sky_dome(panorama, scene_around(CAMERAS.mean(axis=0), 6.0), CAMERAS)
     for heading, pitch in ((0.0, 10.0), (130.0, 35.0), (250.0, 80.0)):
-        camera = skies.look(heading, pitch, x=x)
+        camera = skies.camera_towards(heading, pitch, x=x)
         rendered = rasterizer.render(dome, camera, rasterizer.RenderOptions(0))
         above = torch.from_numpy(elevations_deg(camera, up) > (0.0 if x == 4.0 else 6.0))
         assert float(rendered.alpha[above].min()) > 0.98
@@ -66,7 +66,7 @@ def test_dome_surrounds_the_scene_despite_distant_outliers() -> None:
 
 
 def test_gaussians_of_the_scene_stay_visible() -> None:
-    camera = skies.look(0.0, 30.0, x=4.0)
+    camera = skies.camera_towards(0.0, 30.0, x=4.0)
     ray = directions(camera)[skies.HEIGHT // 2, skies.WIDTH // 2]
     scene = scene_around(CAMERAS.mean(axis=0), 50.0)
     scene.means[7] = torch.from_numpy(camera.centre() + 50.0 * ray / np.linalg.norm(ray)).float()

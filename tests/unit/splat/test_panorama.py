@@ -41,7 +41,7 @@ def test_every_direction_mixes_four_neighbouring_cells() -> None:
 def test_colours_by_elevation_appear_at_their_elevation() -> None:
     rows = (np.arange(ROWS) + 0.5) / ROWS * 180.0 - 90.0
     colours = np.repeat(rows / 90.0, COLUMNS)[:, None].repeat(3, axis=1).astype(np.float32)
-    camera = skies.look(pitch_deg=30.0, roll_deg=25.0)
+    camera = skies.camera_towards(pitch_deg=30.0, roll_deg=25.0)
     seen = Panorama(skies.UP, torch.from_numpy(colours)).behind(camera, BLACK).numpy()
     elevation = elevations_deg(camera, skies.UP)
     inner = (elevation > 0.0) & (elevation < 80.0)
@@ -50,17 +50,17 @@ def test_colours_by_elevation_appear_at_their_elevation() -> None:
 
 def test_colours_do_not_depend_on_the_photo_but_on_the_direction() -> None:
     panorama = random_panorama()
-    camera = skies.look(heading_deg=170.0, pitch_deg=20.0)
+    camera = skies.camera_towards(heading_deg=170.0, pitch_deg=20.0)
     every_pixel = panorama.at(directions(camera)).detach().numpy()
     looked_up = panorama.behind(camera, BLACK).detach().numpy()
     np.testing.assert_allclose(looked_up[::8, ::8], every_pixel[::8, ::8], atol=2e-6)  # above TILTED's horizon
-    turned = skies.look(heading_deg=170.0, pitch_deg=20.0, roll_deg=180.0, x=5.0)
+    turned = skies.camera_towards(heading_deg=170.0, pitch_deg=20.0, roll_deg=180.0, x=5.0)
     np.testing.assert_allclose(panorama.at(directions(turned)).detach().numpy(), every_pixel[::-1, ::-1], atol=1e-5)
 
 
 def test_well_below_the_horizon_the_background_is_kept() -> None:
     panorama = Panorama(skies.UP, torch.full((ROWS * COLUMNS, 3), 0.75))
-    camera = skies.look(pitch_deg=0.0)
+    camera = skies.camera_towards(pitch_deg=0.0)
     seen = panorama.behind(camera, (0.25, 0.0, 1.0)).numpy()
     elevation = elevations_deg(camera, skies.UP)
     np.testing.assert_allclose(seen[elevation > 0.0], 0.75, atol=1e-6)
@@ -70,7 +70,7 @@ def test_well_below_the_horizon_the_background_is_kept() -> None:
 
 def test_gradient_by_the_cells_is_that_of_finite_differences() -> None:
     panorama = random_panorama(torch.float64)
-    camera = skies.look(heading_deg=90.0, pitch_deg=10.0)
+    camera = skies.camera_towards(heading_deg=90.0, pitch_deg=10.0)
     generator = torch.Generator().manual_seed(2)
     weight = torch.rand(skies.HEIGHT, skies.WIDTH, 3, generator=generator, dtype=torch.float64)
     (weight * panorama.behind(camera, BLACK).square()).sum().backward()

@@ -28,7 +28,10 @@ from splatpipe.pipeline.train.techniques.distortion_loss import CENTRE_EVERY, Di
 from splatpipe.pipeline.train.techniques.dropout import Dropout
 
 META = torch.device("meta")
-CAMERAS = [replace(skies.look(heading_deg=10.0 * number).scaled(160, 120), name=f"{number}.jpg") for number in range(3)]
+CAMERAS = [
+    replace(skies.camera_towards(heading_deg=10.0 * number).scaled(160, 120), name=f"{number}.jpg")
+    for number in range(3)
+]
 NAMES = [camera.name for camera in CAMERAS]
 
 

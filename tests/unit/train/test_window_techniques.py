@@ -31,7 +31,7 @@ from splatpipe.pipeline.train.state.density import Density
 from splatpipe.pipeline.train.techniques.distortion_loss import DistortionLoss
 from splatpipe.pipeline.train.techniques.techniques import Techniques
 
-LOOK = skies.look(12.0, roll_deg=4.0)
+LOOK = skies.camera_towards(12.0, roll_deg=4.0)
 CAMERA = LOOK.scaled(331, 247)
 WINDOW_PIXELS = 16_000  # six windows of it
 FLOAT32 = 2e-4  # of a sum over a picture, added up in another order
@@ -130,8 +130,8 @@ def test_the_background_of_a_window_is_that_of_the_whole_there() -> None:
 
 @pytest.mark.parametrize("size", [(331, 247), (320, 240), (900, 680), (201, 150)])
 def test_the_sky_of_a_window_is_the_whole_photos_there(size: tuple[int, int]) -> None:
-    _, sky = skies.trace(skies.look())
-    found, camera = SkyMask.packed(sky), skies.look().scaled(*size)
+    _, sky = skies.trace(skies.camera_towards())
+    found, camera = SkyMask.packed(sky), skies.camera_towards().scaled(*size)
     bits = torch.from_numpy(found.bits)
     wholes = photo_sky_on_cpu(found, camera), photo_sky_on_device(bits, found.shape, camera)
     for window in windows_of(*size, size[0] * size[1] // 5):
