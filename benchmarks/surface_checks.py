@@ -30,9 +30,8 @@ SEED = 18
 TARGET_REACH_PX = 32  # half-size of the search window; a target is some 18 px
 FOUND_PX = 12.0  # a detection farther off is another target, or false
 SEEN_M = 0.05  # a target this far below the visible surface is hidden
-WALL_M = (
-    0.5  # in front of or behind a wall's plane, what belongs to it: reveals, sills, frames, steps at the roof's edge
-)
+# In front of or behind a wall's plane, what belongs to it: reveals, sills, frames, steps at the roof's edge.
+WALL_M = 0.5
 SAME_NORMAL = 0.9  # cosine between a façade's normal and its wall's
 SAME_WALL_M = 2.0  # largest distance between their planes
 WALL_PARTS = (HOUSE, PLAIN, BRICKS)

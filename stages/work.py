@@ -242,7 +242,7 @@ class CaptureWork:
         return min(every, self.costs.pairs * photos * options.neighbours / NEIGHBOURS)
 
     @property
-    def stronger_bytes(self) -> float:
+    def reextraction_bytes(self) -> float:
         """Memory for further keypoints in photos that mapping could not place, which may be none."""
         return (
             REEXTRACTION_BYTES * MEGA * min(self.size.megapixels, REEXTRACTION_MEGAPIXELS) * max(1, self.threads // 2)
@@ -375,7 +375,7 @@ class CaptureWork:
             "control": WorkUnits(controlled, 0.0, controlled),
             "features": WorkUnits(looked, looked_at_once, keypoints),
             "matches": WorkUnits(self.pairs * self.keypoints, float(self.threads), keypoints),
-            "sparse": WorkUnits(photos * mapping, math.sqrt(photos), keypoints, self.stronger_bytes),
+            "sparse": WorkUnits(photos * mapping, math.sqrt(photos), keypoints, self.reextraction_bytes),
             "targets": WorkUnits(controlled * pixels, controlled * targets_at_once, controlled * photos),
             "georef": WorkUnits(photos, keypoints, keypoints),
             "undistort": WorkUnits(pixels, at_once, photos * self.dataset_megapixels),

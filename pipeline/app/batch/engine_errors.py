@@ -111,13 +111,13 @@ class ErrorRecorder(logging.Filter):
             aux = getattr(record, "aux", None) or {}
             message, job = getattr(record, "rule_msg", None) or "", aux.get("external_jobid") or ""
             log = "".join(logs[-1:])
-            error = EngineError(str(message), str(job), log, killed_for_memory=_tells_of_memory(log))
+            error = EngineError(str(message), str(job), log, killed_for_memory=_mentions_memory(log))
             with appended_file(self._path) as file:
                 file.write(json.dumps({"of": [marker.parent.name, marker.name], **asdict(error)}).encode() + b"\n")
         return True
 
 
-def _tells_of_memory(log: str) -> bool:
+def _mentions_memory(log: str) -> bool:
     """Whether Slurm has written into a job's output that the kernel killed one of its processes for memory."""
     with suppress(OSError, SplatpipeError):
         return MEMORY.search(read_end(Path(log), LOG_TAIL_BYTES)) is not None

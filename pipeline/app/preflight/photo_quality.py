@@ -20,7 +20,8 @@ MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation, for 
 JUMP_EV = 1.1  # relative to the neighbours; light and automatic exposure vary by 1.0 in good captures
 CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of clipped pixels, and its excess over most photos
 DARK_LEVEL, BRIGHT_LEVEL = 14.0, 244.0  # mean grey levels of a photo that shows nothing
-LITTLE_TEXTURE = 400  # median of the keypoints at 640 px; all captures tried have 740 or more, blurred small ones 250
+# Median of the keypoints at 640 px; all captures tried have 740 or more, blurred small ones 250.
+MIN_MEDIAN_KEYPOINTS = 400
 MAX_DUPLICATE_DIFFERENCE = 1.0  # largest grey level difference between thumbnails of a photo saved twice
 
 
@@ -64,7 +65,7 @@ def find_blurred(photos: Sequence[CheckedPhoto], duller: Float64[np.ndarray, "n 
 def find_little_texture(all_features: Sequence[QuickFeatures]) -> list[Finding]:
     """Find captures that show hardly anything to match, as thermal ones."""
     usual = float(np.median([len(features.places) for features in all_features]))
-    if usual >= LITTLE_TEXTURE:
+    if usual >= MIN_MEDIAN_KEYPOINTS:
         return []
     hint = texture_hint((features.width, features.height) for features in all_features)
     return [Finding("texture", "warning", "The photos have little texture: few of them will be placed.", hint)]

@@ -85,7 +85,7 @@ def control_findings(
             point.name,
             "check" if point.role == "check" else "control",
             (round(float(at[0]), 2), round(float(at[1]), 2)),
-            _shown_by(at, intake),
+            _count_showing_photos(at, intake),
             len({mark.photo for mark in point.marks}),
         )
         for point, at in zip(file.points, points, strict=True)
@@ -142,7 +142,7 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
     return findings
 
 
-def _shown_by(at: Float64[np.ndarray, " 2"], intake: Intake) -> int | None:
+def _count_showing_photos(at: Float64[np.ndarray, " 2"], intake: Intake) -> int | None:
     """The number of photos that may show a place on the ground; None if their poses are unknown."""
     views = intake.layout.views
     if views is None:

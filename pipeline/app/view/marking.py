@@ -30,7 +30,7 @@ from splatpipe.pipeline.survey.files.control_edit import ControlText
 from splatpipe.pipeline.survey.files.control_file import SurveyedPoint
 
 MAX_UNDO = 10_000
-WIDE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing
+MAX_RAY_ANGLE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing
 HELPFUL_PHOTOS = 20  # photos of a point ordered by how much they help; the rest follow by distance
 DIGITS = 2  # decimal places of pixel coordinates in the file
 # A point in a photo: its mark in pixels, or not visible, or neither.
@@ -319,7 +319,7 @@ def helpful_order(
     """
     directions = centres - place
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-300)
-    chosen, apart = [0], np.full(len(ranks), WIDE_RAD)
+    chosen, apart = [0], np.full(len(ranks), MAX_RAY_ANGLE_RAD)
     while len(chosen) < min(len(ranks), HELPFUL_PHOTOS):
         apart = np.minimum(apart, np.arccos(np.clip(directions @ directions[chosen[-1]], -1.0, 1.0)))
         score = apart / ranks

@@ -1,6 +1,6 @@
 """Elevations of walls: orthographic views, with the distance of each point in front of or behind the wall's plane.
 
-A wall is a vertical sheet. The surface model over it, with the surface nearest to the viewer as the topmost, gives the
+A wall is a vertical plane. The surface model over it, with the surface nearest to the viewer as the topmost, gives the
 depths, and the orthophoto the colours. Objects in front of the wall beyond the height range are left out, and not
 projected onto it: areas that they hide are coloured from photos that see past them, or not at all.
 """
@@ -36,7 +36,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Elevation:
-    """A wall seen from the front; its rasters lie on the sheet's lattice.
+    """A wall seen from the front; its rasters lie on the plane's lattice.
 
     Attributes:
         wall: The wall.
@@ -63,7 +63,7 @@ class Elevation:
 
 
 def wall_plane(wall: Wall, cell_m: float) -> RasterPlane:
-    """The sheet of a wall: whole cells from end to end and from top to foot, with any excess split between both sides.
+    """The plane of a wall: whole cells from end to end and from top to foot, with any excess split between both sides.
 
     Args:
         wall: The wall.
@@ -156,7 +156,7 @@ def remove_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
 
 
 def _photos_in_front(plane: RasterPlane, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
-    """Photos in front of a wall, in its sheet's frame, with their exposure gains."""
+    """Photos in front of a wall, in its plane's frame, with their exposure gains."""
     rows = [
         row
         for row, source in enumerate(photos.sources)

@@ -26,7 +26,7 @@ from splatpipe.pipeline.surface.rasters.whole_file import whole_file, write_whol
 
 FORMAT = 1
 METRE_DIGITS = 4  # decimals of lengths and coordinates in the JSON: a tenth of a millimetre
-LIKELY = 0.95  # the higher of the two quantiles of standard deviations that are reported
+REPORTED_QUANTILE = 0.95  # the higher of the two quantiles of standard deviations that are reported
 
 
 def height_zero_m(elevation: Elevation, crs: MapCrs) -> float:
@@ -86,7 +86,9 @@ def elevation_facts(elevation: Elevation, crs: MapCrs, files: dict[str, str]) ->
     wall, lattice = elevation.wall, elevation.plane.lattice
     known = np.isfinite(elevation.depth)
     sigma = elevation.sigma[known]
-    spread = [None, None] if not sigma.size else [_rounded(float(np.quantile(sigma, q))) for q in (0.5, LIKELY)]
+    spread = (
+        [None, None] if not sigma.size else [_rounded(float(np.quantile(sigma, q))) for q in (0.5, REPORTED_QUANTILE)]
+    )
     return {
         "name": wall.name,
         "corners": _listed(crs.crs_from_local(elevation.corners())),

@@ -32,7 +32,7 @@ from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, divide_int
 from splatpipe.pipeline.surface.sheets.sheet_work import Arrays, SheetWork
 
 PIXEL_BYTES = 1 << 30  # limit for decoded photos in memory; beyond it, all are kept on disk
-AROUND = 3  # margin in cells of the surface model around the pixels, for interpolation
+HEIGHT_MARGIN_CELLS = 3  # margin in cells of the surface model around the pixels, for interpolation
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ def _colours(
 def _has_heights(known: KnownCells, heights: Grid, grid_sheet: GridSheet, tile: Tile) -> bool:
     """Whether any pixels of a sheet's tile may have a height."""
     part = Tile(grid_sheet.part.row + tile.row, grid_sheet.part.column + tile.column, tile.height, tile.width)
-    return known.any_in(_cells_under(grid_sheet.grid, part, heights, AROUND * heights.cell))
+    return known.any_in(_cells_under(grid_sheet.grid, part, heights, HEIGHT_MARGIN_CELLS * heights.cell))
 
 
 def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
@@ -145,7 +145,7 @@ def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
 
 def _surface(grid_sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
     """The heights under a sheet's pixels, relative to the sheet."""
-    margin = (MARGIN + EXTENDED_CELLS) * grid_sheet.grid.cell + AROUND * heights.cell
+    margin = (MARGIN + EXTENDED_CELLS) * grid_sheet.grid.cell + HEIGHT_MARGIN_CELLS * heights.cell
     part = _cells_under(grid_sheet.grid, grid_sheet.part, heights, margin)
     rows = np.clip([part.row, part.row + part.height], 0, heights.height)
     columns = np.clip([part.column, part.column + part.width], 0, heights.width)

@@ -114,7 +114,7 @@ def unit_name(unit_m: float) -> str:
 
 
 def _plane(world: World) -> World:
-    """The same world in a projected CRS whose first axis does not point west."""
+    """This world in a projected CRS whose first axis does not point west."""
     if usable_for_maps(world.crs):
         return world
     latitude, longitude = world.origin.latitude, world.origin.longitude

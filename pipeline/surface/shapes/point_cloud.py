@@ -133,7 +133,7 @@ def _header(frame: CloudFrame, taken_on: date) -> laspy.LasHeader:
 
 
 def _pieces(chunks: Iterable[CloudChunk]) -> Iterator[CloudChunk]:
-    """The same points, at most ``ROWS`` at a time."""
+    """These points, at most ``ROWS`` at a time."""
     for chunk in chunks:
         for start in range(0, len(chunk.positions), ROWS):
             rows = slice(start, start + ROWS)

@@ -28,7 +28,7 @@ class RasterPlane:
     """A plane with cells, and the height range to consider over it.
 
     Attributes:
-        from_local: Rigid, from local metres to the sheet's: along the rows, against the columns, towards the viewer.
+        from_local: Rigid, from local metres to the plane's: along the rows, against the columns, towards the viewer.
         lattice: Its cells.
         relief: Range of heights over the plane.
     """
@@ -38,7 +38,7 @@ class RasterPlane:
     relief: HeightRange
 
     def plane_from_local(self, local: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """East, north, up (metres) in the sheet's frame."""
+        """East, north, up (metres) in the plane's frame."""
         return np.asarray(local @ self.from_local[:3, :3].T + self.from_local[:3, 3])
 
     def local_from_plane(self, places: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
@@ -46,14 +46,14 @@ class RasterPlane:
         return np.asarray((places - self.from_local[:3, 3]) @ self.from_local[:3, :3])
 
     def transform_camera(self, camera: Camera) -> Camera:
-        """Transform a camera from the local to the sheet's frame."""
+        """Transform a camera from the local to the plane's frame."""
         back = np.eye(4)
         back[:3, :3] = self.from_local[:3, :3].T
         back[:3, 3] = -back[:3, :3] @ self.from_local[:3, 3]
         return replace(camera, cam_from_world=camera.cam_from_world @ back)
 
     def transform_depths(self, source: DepthSource) -> DepthSource:
-        """Transform a photo's depths from the local to the sheet's frame."""
+        """Transform a photo's depths from the local to the plane's frame."""
         camera = self.transform_camera(source.camera)
 
         def load() -> PosedDepthMap:
@@ -63,7 +63,7 @@ class RasterPlane:
         return DepthSource(camera, load)
 
     def transform_photo(self, photo: PhotoSource) -> PhotoSource:
-        """Transform a photo with its depths from the local to the sheet's frame."""
+        """Transform a photo with its depths from the local to the plane's frame."""
         depths = None if photo.depths is None else self.transform_depths(photo.depths)
         return replace(photo, camera=self.transform_camera(photo.camera), depths=depths)
 
@@ -75,7 +75,7 @@ class GridSheet:
     Attributes:
         grid: The raster's grid.
         part: The grid's cells that the sheet's lattice has.
-        plane: The sheet.
+        plane: The plane of its cells.
     """
 
     grid: Grid

@@ -23,7 +23,7 @@ from splatpipe.stages.options import LineConfig
 README = ROOT / "README.md"
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [README, *DOCS]
-MAX_README_LINES = 150  # lines: what a surveyor reads in an afternoon, with the run
+LONGEST_README = 150  # lines: what a surveyor reads in an afternoon, with the run
 FIRST_SCREEN = 30  # lines
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 QUICK = (
@@ -73,7 +73,7 @@ def links(page: Path) -> list[str]:
 
 
 def test_the_readme_takes_an_afternoon_and_leads_to_every_page() -> None:
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= MAX_README_LINES
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= LONGEST_README
     linked = {(ROOT / link.partition("#")[0]).resolve() for link in links(README)}
     assert set(DOCS) <= linked
 
