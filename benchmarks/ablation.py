@@ -32,7 +32,7 @@ from splatpipe.stages.line import LINE
 
 VARIANTS = Path(__file__).with_suffix(".toml")
 FRONT_SIZE = 4.0  # photos are registered once at this multiple of the training size; each run downsamples them
-LARGEST_FRONT = 200.0  # megapixels
+MAX_FRONT_MEGAPIXELS = 200.0  # megapixels
 FOLLOW = VARIANTS.with_name("time_to_quality.py")
 CURVE = "curve.json"
 RECORDED = ("psnr", "psnr_cc", "best_psnr")  # figures of a finished run, recorded along the way
@@ -103,7 +103,7 @@ def captures_of(texts: Sequence[str]) -> dict[str, Path]:
 
 def front_sets(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Return the base options for the photos: larger than the training size, since each run downsamples them."""
-    size = min(LARGEST_FRONT, FRONT_SIZE * config_of(base_sets(arguments), 0).undistort.max_megapixels)
+    size = min(MAX_FRONT_MEGAPIXELS, FRONT_SIZE * config_of(base_sets(arguments), 0).undistort.max_megapixels)
     return (*base_sets(arguments), f"undistort.max_megapixels={size!r}")
 
 

@@ -46,12 +46,12 @@ from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.recovery.ladder import run_ladder
 from splatpipe.stages.line import LINE, MATCHES
 
-GUESS = 1.2  # of the longer side: COLMAP's guess if nothing is known
-PLACED = 0.9  # share of the photos
-TIMES, SOUND_M = 3.0, 3.6e-3  # times the demo's sound error, metres
-EXTENT = 0.005  # of the RMS distance of the cameras from their mean, for captures without truth
+RELATIVE_FOCAL_GUESS = 1.2  # focal length over the longer side that COLMAP assumes if nothing is known
+MIN_PLACED_SHARE = 0.9  # share of the photos
+MAX_ERROR_TIMES, SOUND_M = 3.0, 3.6e-3  # times the demo's sound error, metres
+MAX_RELATIVE_ERROR = 0.005  # error over the RMS distance of the cameras from their mean, for captures without truth
 FOLDED = (0.3, 0.5)  # shares of a scene that look alike
-MIN_MATCHES = 15  # of a pair that is kept
+MIN_MATCHES = 15  # fewest matches with which a pair is kept
 
 Pair = tuple[int, int]
 Truth = Mapping[str, np.ndarray]
@@ -126,7 +126,7 @@ def thin(source: Path, target: Path, variant: ThinnedGraph) -> None:
         for camera in sorted(old.read_all_cameras(), key=lambda camera: camera.camera_id):
             camera.has_prior_focal_length = False
             params = np.array(camera.params)
-            params[list(camera.focal_length_idxs())] = GUESS * max(camera.width, camera.height)
+            params[list(camera.focal_length_idxs())] = RELATIVE_FOCAL_GUESS * max(camera.width, camera.height)
             camera.params = params
             new.write_camera(camera, use_camera_id=True)
         for rig in sorted(old.read_all_rigs(), key=lambda rig: rig.rig_id):
@@ -236,7 +236,7 @@ def try_variants(out: Path, only: Sequence[str], variants: Sequence[ThinnedGraph
         scratch = Path(folder)
         capture = open_capture(out, scratch)
         truth = demo_truth() if sound_m else truth_of(answer(capture)[0])
-        bound = TIMES * sound_m or EXTENT
+        bound = MAX_ERROR_TIMES * sound_m or MAX_RELATIVE_ERROR
         for variant in variants:
             if only and variant.name not in only:
                 continue
@@ -255,7 +255,7 @@ def try_variants(out: Path, only: Sequence[str], variants: Sequence[ThinnedGraph
 def _verdict(row: Row, error: float, bound: float, total: int) -> str:
     if row["verdict"] == "bad":
         return "called bad"
-    return "right" if row["placed"] >= PLACED * total and error <= bound else "WRONG"
+    return "right" if row["placed"] >= MIN_PLACED_SHARE * total and error <= bound else "WRONG"
 
 
 def looks_alike(model: pycolmap.Reconstruction, share: float) -> set[int]:

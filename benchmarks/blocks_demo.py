@@ -35,7 +35,7 @@ COLUMNS = {
     "memory MB": "memory:MB",
     "coarse pass's": "before:MB",
 }
-KILLED_AT = 0.3  # of a block's iterations
+KILLED_AT = 0.3  # share of a block's iterations after which its process is killed
 
 
 def splatpipe(*words: object) -> list[str]:

@@ -30,7 +30,7 @@ from splatpipe.pipeline.photos.pixels.images import reduced_view
 from splatpipe.pipeline.raster.threads import same_bits
 
 MARGIN_M = 1.0  # around the house, as if drawn by hand on a map
-CORNER_STEPS = 16  # of the circle that the outline is grown with
+CORNER_STEPS = 16  # corners of the polygon that stands for the circle by which the outline is grown
 COLUMNS = {
     "view": "view:",
     "inside": "inside:.3f",
@@ -89,8 +89,8 @@ def measured(
         inside = true_inside(replace(camera, cam_from_world=truth.camera_pose(camera.cam_from_world)), surface)
         render = run.picture(camera)
         errors = np.square((render.astype(np.float64) - photo) / 255.0).mean(axis=2)
-        counted = np.ones(inside.shape, np.bool_) if mask is None else mask
-        parts = [rows & counted for rows in (inside, ~inside)]
+        valid = np.ones(inside.shape, np.bool_) if mask is None else mask
+        parts = [rows & valid for rows in (inside, ~inside)]
         found[view.camera.name] = (
             np.array([errors[rows].sum() for rows in parts]),
             np.array([rows.sum() for rows in parts], np.float64),

@@ -22,7 +22,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.splat.model.scene import Axes, turn_of
 
-PATIENCE_MS = 600_000.0  # for a busy machine
+TIMEOUT_MS = 600_000.0  # for a busy machine
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PAGE = '<!doctype html><meta charset="utf-8"><script src="draw.js"></script>'
 SPARK_TYPES = {"ply": "ply", "compressed-ply": "ply", "spz": "spz", "spz2": "spz", "sog": "pcsogszip", "glb": "glb"}
@@ -52,7 +52,7 @@ def drawing_page(others: OtherPrograms, folder: Path) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
         page = browser.new_page()
-        page.set_default_timeout(PATIENCE_MS)
+        page.set_default_timeout(TIMEOUT_MS)
         page.goto(f"http://127.0.0.1:{server.server_port}/draw.html")
         yield page
         browser.close()

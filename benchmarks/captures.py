@@ -20,7 +20,7 @@ from splatpipe.pipeline.splat.model.scene import Axes, Scene
 
 Picture = Float[np.ndarray, "h w 3"]
 NEAR_M = 0.1
-MAX_PIXELS = 500_000  # of an image that is compared
+MAX_PIXELS = 500_000  # largest image that is compared; larger ones are reduced
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
 AXES: tuple[Axes, ...] = ("z up", "y up", "y down")
 

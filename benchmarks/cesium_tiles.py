@@ -49,7 +49,7 @@ SIGMA_M = 0.15
 CORNERS_M = 1500.0
 SPACING_M = 12.0
 PER_NODE = 40  # for the site: low enough for its corners to become separate tiles
-PATIENCE_MS = 300_000.0
+TIMEOUT_MS = 300_000.0
 
 
 @dataclass
@@ -176,7 +176,7 @@ def opened(folder: Path, modules: Path) -> Iterator[tuple[Page, PageProblems]]:
         path = shutil.which("chromium") or shutil.which("google-chrome")
         browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-        page.set_default_timeout(PATIENCE_MS)
+        page.set_default_timeout(TIMEOUT_MS)
         page.on("console", lambda said: heard.errors.append(said.text) if said.type == "error" else None)
         page.on("pageerror", lambda error: heard.errors.append(str(error)))
         page.on("request", lambda asked: heard.strangers.append(asked.url) if foreign(asked.url, home) else None)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 POLL_S = 0.1  # far shorter than any run
 GRACE_S = 10.0  # the pipeline ends within five seconds of a signal
-LONGEST_MESSAGE = 400  # characters of an error message that are reported; the log has the rest
+MAX_MESSAGE_LETTERS = 400  # characters of an error message that are reported; the log has the rest
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _failure(command: Command, code: int) -> str:
     except (ValueError, KeyError, TypeError):
         text = f"It ended with exit code {code}; see {command.log}."
     text = " ".join(text.split())
-    return text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}…"
+    return text if len(text) <= MAX_MESSAGE_LETTERS else f"{text[:MAX_MESSAGE_LETTERS]}…"
 
 
 def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 BOMB_BYTES = 600_000_000  # unpacked: more than a reader may take in memory
-LARGEST_WEBP_PX = 16_384  # per side: 14 bits of a VP8L header, minus one
+MAX_WEBP_PX = 16_384  # per side: 14 bits of a VP8L header, minus one
 FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # the earliest that a ZIP can store
 SPZ_4_HEADER, SPZ_4_ENTRY = struct.Struct("<IIIBBBBI12x"), struct.Struct("<QQ")
 
@@ -81,7 +81,7 @@ def _webp_layer(data: bytes) -> Layer:
 
     def packed(inner: bytes) -> bytes:
         width = max(1, min(len(inner) // 4, pixels.shape[1]))
-        height = max(1, min(len(inner) // (4 * width), LARGEST_WEBP_PX - 1))
+        height = max(1, min(len(inner) // (4 * width), MAX_WEBP_PX - 1))
         raw = inner[: 4 * width * height].ljust(4 * width * height, b"\0")
         found = io.BytesIO()
         Image.frombytes("RGBA", (width, height), raw).save(
@@ -183,7 +183,7 @@ def _stored(members: dict[str, bytes]) -> bytes:
     return found.getvalue()
 
 
-def blank_webp(side_px: int = LARGEST_WEBP_PX) -> bytes:
+def blank_webp(side_px: int = MAX_WEBP_PX) -> bytes:
     """Return a square lossless image of one colour in 40 bytes: a prefix code of one symbol needs zero bits per pixel.
 
     RFC 9649: 14 bits per side (minus one), alpha, 3 bits of version; no transform, no colour cache, no meta prefix

@@ -45,7 +45,7 @@ WITHIN_GSD = 2.0
 ATTACHED_M = 0.05  # in front of the house: the survey targets on its walls, including oblique views of them
 FULL_SCALE_GSD = 4.0  # error with the brightest colour, the same in every image
 NOT_THE_HOUSE = 0.35  # how much brightness the rest of the image keeps
-LARGEST_MEGAPIXELS = 1e6  # no limit
+MAX_MEGAPIXELS = 1e6  # no limit
 SIZES = {"half": 0.5, "training": 1.0, "double": 2.0}
 
 DEPTH_COLUMNS = {
@@ -154,7 +154,7 @@ def photos_at(run: OpenedRun, names: Sequence[str], factor: float) -> dict[str, 
     part = run.parts["ingest.photos"].path
     model, photos = pycolmap.Reconstruction(run.parts["georef.model"].path), load_photo_list(part).photos
     cameras = {view.camera.name: run.camera(view) for view in run.views}
-    full = plan_views(model, photos, LARGEST_MEGAPIXELS, SilentReporter())[0]
+    full = plan_views(model, photos, MAX_MEGAPIXELS, SilentReporter())[0]
     trained, whole = cameras[full.photo.name], full.target
     scale = factor * max(trained.width / whole.width, trained.height / whole.height) + 1e-9  # sizes are rounded down
     placed = plan_views(model, photos, scale**2 * 1e-6 * whole.width * whole.height, SilentReporter())
@@ -179,15 +179,15 @@ def measure_scales(run: OpenedRun, others: dict[str, OpenedRun], names: Sequence
         row |= {"pixels": f"{camera.width}x{camera.height}"} | mean_measures(
             [_measured(run, *v) for v in views.values()]
         )
-        shown = [views[trained.name][1], run.picture(camera)]
+        pictures = [views[trained.name][1], run.picture(camera)]
         if size in others:
             other = others[size]
             figures = mean_measures([_measured(other, *view) for view in views.values()])
             row |= {f"other_{key}": value for key, value in figures.items()}
             own = other.camera(next(view for view in other.views if view.camera.name == trained.name))
             row |= {"other_pixels": f"{own.width}x{own.height}", "below": row["other_psnr"] - row["psnr"]}
-            shown.append(other.picture(camera))
-        write_png(folder / f"{Path(trained.name).stem}.{size}.png", np.hstack(shown))
+            pictures.append(other.picture(camera))
+        write_png(folder / f"{Path(trained.name).stem}.{size}.png", np.hstack(pictures))
         rows.append(row)
     return rows
 

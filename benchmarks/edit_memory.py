@@ -28,7 +28,7 @@ from splatpipe.pipeline.splat.model.scene import SceneFacts, SplatOrigin
 BYTES = 236  # per Gaussian of degree 3 in memory
 PART = 500_000
 FACTS = SceneFacts("z up", False, True, SplatOrigin(52.2, 21.0, 113.25, "EPSG:5773", "EPSG:32634"))
-CAMERA_HEIGHT_M, CAMERA_PX = 30.0, (1200, 900)  # of the photos of the run that is cleaned
+CAMERA_HEIGHT_M, CAMERA_PX = 30.0, (1200, 900)  # height above ground and image size of the photos of the cleaned run
 CAMERA_PLACES_M = (-25.0, 0.0, 25.0)  # along both axes
 
 

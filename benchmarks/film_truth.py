@@ -38,11 +38,11 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 LATITUDE, LONGITUDE, HEIGHT_M = 47.84119, 13.51269, 515.0  # the demo's origin
 METRES_PER_DEGREE = 111_320.0
 RADIUS_M, LOW_M, HIGH_M, TARGET_M = 24.0, 7.0, 14.0, (0.0, 0.0, 2.5)
-FOCAL = 0.72  # of the width
+RELATIVE_FOCAL = 0.72  # focal length over the image width
 RECEIVER_M = 1.0  # standard deviation of the SRT's positions
 GAMMA = 2.2
-BANDS = 18  # of rows with moments of their own under a rolling shutter
-MOST_TIMES, MOST_DB = 2.0, 1.0
+BANDS = 18  # bands of rows that are exposed at different moments under a rolling shutter
+MAX_TIMES, MAX_LOSS_DB = 2.0, 1.0
 
 COLUMNS = {
     "run": "run:",
@@ -90,7 +90,7 @@ class Flight:
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
         pose[:3, 3] = -pose[:3, :3] @ centre
-        focal = FOCAL * self.width
+        focal = RELATIVE_FOCAL * self.width
         return Camera("", self.width, self.height, focal, focal, self.width / 2.0, self.height / 2.0, pose)
 
 
@@ -132,9 +132,9 @@ def write_subtitles(path: Path, flight: Flight) -> None:
         east, north, up = flight.centre(float(second)) + generator.normal(0.0, RECEIVER_M, 3)
         latitude = LATITUDE + north / METRES_PER_DEGREE
         longitude = LONGITUDE + east / (METRES_PER_DEGREE * math.cos(math.radians(LATITUDE)))
-        shown = [f"00:{at // 60:02d}:{at % 60:02d},000" for at in (second, second + 1)]
+        times = [f"00:{at // 60:02d}:{at % 60:02d},000" for at in (second, second + 1)]
         cues.append(
-            f"{second + 1}\n{shown[0]} --> {shown[1]}\n2026-06-18 13:{second // 60:02d}:{second % 60:02d}.000\n"
+            f"{second + 1}\n{times[0]} --> {times[1]}\n2026-06-18 13:{second // 60:02d}:{second % 60:02d}.000\n"
             f"[latitude: {latitude:.7f}] [longitude: {longitude:.7f}] "
             f"[rel_alt: {up:.3f} abs_alt: {HEIGHT_M + up:.3f}]\n"
         )
@@ -232,9 +232,9 @@ def _run(name: str, photos: Path, out: Path, flight: Flight, options: argparse.N
 
 def _with_bars(rows: Sequence[Row]) -> list[Row]:
     film, still = rows
-    met = film["placed"] == film["frames"] and film["rms_mm"] <= MOST_TIMES * still["rms_mm"]
+    met = film["placed"] == film["frames"] and film["rms_mm"] <= MAX_TIMES * still["rms_mm"]
     if film["psnr_cc"] is not None and still["psnr_cc"] is not None:
-        met = met and film["psnr_cc"] >= still["psnr_cc"] - MOST_DB
+        met = met and film["psnr_cc"] >= still["psnr_cc"] - MAX_LOSS_DB
     return [{**film, "bars": "met" if met else "NOT MET"}, {**still, "bars": ""}]
 
 

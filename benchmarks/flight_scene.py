@@ -22,11 +22,11 @@ from splatpipe.pipeline.sfm.pairing.pairs import Layout, Pair, select_pairs
 WIDTH, HEIGHT, FOCAL_PX, RADIAL = 2000, 1500, 1500.0, -0.04
 FLYING_M = 60.0
 GSD_M = FLYING_M / FOCAL_PX
-ROUGH_M = 8.0  # range of the ground's heights
+RELIEF_M = 8.0  # range of the ground's heights
 FORWARD_M, SIDE_M = 15.0, 26.0  # between photos of a strip and between strips: 3/4 and 2/3 overlap
 OBLIQUE = 5  # every n-th strip looks to the side, 35° off the vertical
 OBLIQUE_DEG = 35.0
-LONGEST_TRACK = 12
+MAX_TRACK = 12
 OBSERVATIONS = 1700  # per photo; fewer near the border
 DETECTED = 0.75  # share of the points in a photo that have a keypoint there
 MATCHED = 0.8  # share of the keypoints common to two photos
@@ -120,7 +120,7 @@ def _heights(places: Float64[np.ndarray, "p 2"], rng: np.random.Generator) -> Fl
     rolling = np.sin(places[:, 0] / 37.0) * np.cos(places[:, 1] / 51.0)
     block = np.floor(places / 14.0).astype(np.int64)
     houses = rng.uniform(-1.0, 1.0, 4096)[(block[:, 0] * 61 + block[:, 1] * 17) % 4096]
-    return np.asarray(ROUGH_M / 4.0 * rolling + ROUGH_M / 2.0 * np.maximum(houses, 0.0))
+    return np.asarray(RELIEF_M / 4.0 * rolling + RELIEF_M / 2.0 * np.maximum(houses, 0.0))
 
 
 def _see(
@@ -138,8 +138,8 @@ def _see(
     )  # far outside, the distortion polynomial turns back
     near, local = near[inside], local[inside]
     places = np.asarray(lens().img_from_cam(local)) + rng.normal(0.0, NOISE_PX, (len(local), 2))
-    shown = (places > 0.0).all(axis=1) & (places < [WIDTH, HEIGHT]).all(axis=1) & (rng.random(len(local)) < DETECTED)
-    order = rng.permutation(np.flatnonzero(shown))  # the keypoints' order must not help mapping
+    visible = (places > 0.0).all(axis=1) & (places < [WIDTH, HEIGHT]).all(axis=1) & (rng.random(len(local)) < DETECTED)
+    order = rng.permutation(np.flatnonzero(visible))  # the keypoints' order must not help mapping
     return near[order], places[order]
 
 
@@ -149,7 +149,7 @@ def _capped(point: Int64[np.ndarray, " m"], rng: np.random.Generator) -> np.ndar
     counts = np.bincount(point)
     rank = np.arange(len(point)) - np.repeat(np.cumsum(counts) - counts, counts)
     kept = np.empty(len(point), bool)
-    kept[order] = rank < LONGEST_TRACK
+    kept[order] = rank < MAX_TRACK
     return kept
 
 

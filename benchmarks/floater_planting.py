@@ -16,7 +16,7 @@ from splatpipe.pipeline.raster.reference import project
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 KINDS = ("single", "cluster", "near a surface", "haze", "oversized")
-SHARES = (1.0, 1.0, 1.0, 0.5, 0.2)  # of each kind: large floaters are rare
+SHARE_BY_KIND = (1.0, 1.0, 1.0, 0.5, 0.2)  # planted floaters over the number asked for, by kind: large ones are rare
 CLUSTER = 40  # Gaussians per cluster
 NEAREST = 0.06  # share of the depth: anything nearer to a camera is haze
 SIGMAS = 2.0  # clearance between a floater's extent and the surface
@@ -26,7 +26,7 @@ TOUCHING = 0.01  # share of a depth: anything this close to the surface in two v
 CAMERAS = 24  # number whose depths are rendered, spread over the capture
 FAR = 2.0  # times an image's median depth: farther surfaces are unreliable
 SURE_VIEWS = 2  # that must see a Gaussian at its surface for it to count as building
-LARGEST_DONOR = 0.9  # quantile of sizes: backgrounds have Gaussians as large as the scene
+MAX_DONOR_QUANTILE = 0.9  # quantile of sizes: backgrounds have Gaussians as large as the scene
 
 Points = Float64[np.ndarray, "n 3"]
 Depth = Float64[np.ndarray, "h w"]
@@ -101,7 +101,7 @@ def plant(
     donors = _donors(model, building)
     parts, kinds = [], []
     for kind in range(len(KINDS)):
-        left = round(SHARES[kind] * per_kind)
+        left = round(SHARE_BY_KIND[kind] * per_kind)
         while left > 0:
             part = _attempt(model, donors, views[generator.integers(len(views))], kind, options, generator)
             part = part.select(torch.from_numpy(~_at_surfaces(part, views, TOUCHING)))
@@ -127,7 +127,7 @@ def _at_surfaces(gaussians: Gaussians, views: Sequence[FloaterView], margin: flo
 
 def _donors(model: Gaussians, building: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " d"]:
     size = model.log_scales.max(dim=1).values.numpy()
-    return np.flatnonzero(building & (size < np.quantile(size[building], LARGEST_DONOR)))
+    return np.flatnonzero(building & (size < np.quantile(size[building], MAX_DONOR_QUANTILE)))
 
 
 def _attempt(
@@ -196,5 +196,5 @@ def _stands(found: Gaussians, view: FloaterView, options: rasterizer.RenderOptio
     with np.errstate(invalid="ignore"):
         clear = view.gaps(means) > np.minimum(reach, 0.5)
     splats = project(found, view.camera, options)
-    shown = splats.usable & (splats.opacities >= SEEN_ALPHA)
-    return np.asarray(clear & shown.numpy() & (depth > 0.0))
+    visible = splats.usable & (splats.opacities >= SEEN_ALPHA)
+    return np.asarray(clear & visible.numpy() & (depth > 0.0))

@@ -27,8 +27,8 @@ TABLE = Path(__file__).with_name("forecast.json")
 FITTED_TO = "preview"  # runs of other presets are reported, not fitted
 MEMORY_WITHIN = 0.3
 CPU_WITHIN = 1.5
-ROUNDING = 0.01  # of the costs in `stages/costs.py`, which have three digits
-SHOWN = ("features", "matches", "sparse", "initialize", "train")
+ROUNDING = 0.01  # relative rounding error of the costs in `stages/costs.py`, which have three digits
+DISPLAYED_STAGES = ("features", "matches", "sparse", "initialize", "train")
 
 
 def main() -> int:
@@ -110,7 +110,7 @@ def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
                 "holds": ""
                 if math.isnan(outcome.memory)
                 else " ".join("yes" if well else "NO" for well in holds(outcome)),
-                **{stage: outcome.stages.get(stage, math.nan) for stage in SHOWN},
+                **{stage: outcome.stages.get(stage, math.nan) for stage in DISPLAYED_STAGES},
             }
         )
     columns = {
@@ -123,7 +123,7 @@ def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
         "disk ×": "disk:.2f",
         "both hold": "holds",
     }
-    print_table(title, table, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in SHOWN})
+    print_table(title, table, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in DISPLAYED_STAGES})
 
 
 if __name__ == "__main__":

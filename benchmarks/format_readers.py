@@ -27,12 +27,12 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.containers.ply import write_splat
 from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
 
-SAME_DB = 0.1  # below the result of our own reader
+MAX_LOSS_DB = 0.1  # below the result of our own reader
 SURE_DB = 100.0  # above this, differences are rounding
 LIKE_OURS_DB = 30.0  # spark renders differently
 WORSE_DB = 0.5  # than the format's loss and spark's difference on the PLY together
 ACCESSORS = 1e-5
-PIXELS = 200_000  # of an image in the browser
+MAX_PIXELS = 200_000  # largest image that the browser renders
 EXPECTED = "MESH_PRIMITIVE_INVALID_ATTRIBUTE"  # gltf-validator does not know the extension's names
 
 COLUMNS = {"reader": "reader:", "of": "format:", "what": "what:", "figure": "figure:", "bars": "bars:"}
@@ -78,7 +78,7 @@ def check_splat_transform(bench: Bench) -> Iterator[Row]:
         found = decibels(capture.pictures(placed), originals)
         ours = decibels(capture.pictures(kind.read(path)), originals) if kind.reads else found
         count, whole = len(read.gaussians), len(capture.scene.gaussians)
-        met = count == whole and found >= min(ours - SAME_DB, SURE_DB)
+        met = count == whole and found >= min(ours - MAX_LOSS_DB, SURE_DB)
         figure = f"{count:,} of {whole:,}; {frame}; {found:.2f} dB, by our reader {ours:.2f}"
         yield line("splat-transform", kind.name, "reads it as we do", figure, met)
 
@@ -136,7 +136,7 @@ def check_accessors(bench: Bench) -> Iterator[Row]:
 def check_spark(bench: Bench) -> Iterator[Row]:
     """Compare spark's images (GLB by three's loader) with our rasterizer's."""
     scene, camera = bench.capture.scene, bench.capture.cameras[0]
-    shrink = math.sqrt(min(1.0, PIXELS / (camera.width * camera.height)))
+    shrink = math.sqrt(min(1.0, MAX_PIXELS / (camera.width * camera.height)))
     camera = camera.scaled(round(camera.width * shrink), round(camera.height * shrink))
     capture = replace(bench.capture, cameras=[camera])
     flat = replace(scene, gaussians=replace(scene.gaussians, sh=scene.gaussians.sh[:, :1]))

@@ -30,7 +30,7 @@ from splatpipe.pipeline.splat.model.scene import Scene
 ASKED_S = {"sog": 120.0, "streamed-sog": 120.0}
 OTHERS_ASKED_S = 5.0
 MIN_SHRUNK = {"sog": 15.0}
-JITTER = (0.02, 0.02, 0.05, 0.02)  # of positions in units, colours, opacity logits and logarithms of scales
+JITTER = (0.02, 0.02, 0.05, 0.02)  # standard deviations: positions in units, colours, opacity logits, log-scales
 SEED = 19
 
 COLUMNS = {

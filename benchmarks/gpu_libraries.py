@@ -15,7 +15,7 @@ from gpu_parts import Row
 ROOT = Path(__file__).resolve().parents[1]
 NATIVE = ROOT / "pipeline" / "native"
 FIND_PYTHON = Path(__file__).parent / "stable_abi"  # in place of CMake's FindPython, which wants an interpreter
-ARCHITECTURE = "90"  # of H100 and H200
+ARCHITECTURE = "90"  # compute capability times ten: H100 and H200
 DEBIAN = "deb http://deb.debian.org/debian trixie main"  # with Python 3.13, whose headers know the ABI of 3.12
 HEADERS = "libpython3.13-dev"
 STABLE = "_native.abi3.so"

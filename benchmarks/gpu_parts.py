@@ -24,7 +24,7 @@ from typing import Any
 Row = dict[str, Any]
 
 MIN_S = 4.0  # a part with less time left is not started
-LONGEST_ERROR = 1200  # characters of a failed part's last output
+MAX_ERROR_LETTERS = 1200  # characters of a failed part's last output
 GRACE_S = 1.5  # from SIGTERM to SIGKILL, and from there until a process that cannot be killed is left alone
 POLL_S = 0.02
 REFUSED = 77  # exit code of a part that the machine does not permit
@@ -164,7 +164,7 @@ class PartProcess:
         """Return the end of what it printed."""
         with contextlib.suppress(FileNotFoundError), self._log.open("rb") as file:
             file.seek(self._log_from)
-            return file.read().decode(errors="replace").strip()[-LONGEST_ERROR:]
+            return file.read().decode(errors="replace").strip()[-MAX_ERROR_LETTERS:]
         return ""
 
     def _wait(self, until: float) -> int | None:
@@ -194,7 +194,7 @@ def run_entry(part: GpuPart, file: VisitFile) -> int:
     try:
         for row in getattr(importlib.import_module(module), function)(**part.arguments):
             file.write({"part": part.name, "row": row})
-            print("   " + shown(row), flush=True)
+            print("   " + row_text(row), flush=True)
     except Refusal as error:
         print(f"refused: {error}", flush=True)
         return REFUSED
@@ -264,7 +264,7 @@ def _taken(running: list[PartProcess]) -> Iterator[PartProcess]:
         yield running.pop(0)
 
 
-def shown(row: Row) -> str:
+def row_text(row: Row) -> str:
     """Return a row as one line of text."""
     texts = {key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in row.items()}
     return "  ".join(f"{key} {text}" for key, text in texts.items())

@@ -31,7 +31,7 @@ from torch.nn.functional import conv2d
 
 from splatpipe.pipeline.geometry.camera import Camera
 
-WINDOW, SIGMA = 11, 1.5  # of SSIM, as published
+WINDOW, SIGMA = 11, 1.5  # SSIM's window in pixels and its Gaussian's deviation, as published
 C1, C2 = 0.01**2, 0.03**2
 BETAS, EPSILON = (0.9, 0.999), 1e-15
 RATES = {"means": 1.6e-5, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": 2.5e-3}

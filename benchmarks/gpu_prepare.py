@@ -29,12 +29,12 @@ from splatpipe.pipeline.photos.pixels.dataset import IMAGES, Split, split_views
 
 ROOT = Path(__file__).resolve().parents[1]
 DATASET, POINTS = "bench_sceaux", "sparse"
-DENSE_POINTS = "sparse_100k"  # of the trained scene, which has no more Gaussians: 24 MB
-QUALITY = 90  # of the transferred JPEGs: a third of PNG's size, and both devices train on the same
-TRAINED_ITERATIONS, MOST_TRAINED = 1500, 100_000  # of the trained scene
+DENSE_POINTS = "sparse_100k"  # initial points of the trained scene, which gets no more Gaussians: 24 MB
+JPEG_QUALITY = 90  # JPEG quality of the transferred photos: a third of PNG's size, and both devices train on them
+TRAINED_ITERATIONS, MAX_TRAINED_GAUSSIANS = 1500, 100_000  # training length and Gaussians of the trained scene
 MEBIBYTE = 1 << 20
 MAX_MEBIBYTES = 64  # limit for the tree and everything carried
-LONGEST_COMMAND = 2000  # characters
+MAX_COMMAND_LETTERS = 2000  # characters
 # Missing on that machine: pydantic with what it needs, and what the engine's configuration imports.
 WHEELS = ("pydantic", "pydantic-core", "annotated-types", "typing-inspection", "tomli-w")
 PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014", "manylinux1")
@@ -104,7 +104,7 @@ def copy_parts(parts: dict[str, Path], target: Path) -> None:
             shutil.copy2(path, scratch / name)
     for photo in filter(Path.is_file, (scratch / "undistort.dataset" / IMAGES).rglob("*")):
         picture = cv2.imread(str(photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if len(data) < photo.stat().st_size:
             photo.unlink()  # not overwritten: it may be a link into the store
             photo.write_bytes(data.tobytes())
@@ -115,7 +115,7 @@ def train_scene(dataset: Path, pack: Path) -> Row:
     """Train the capture from many points, on the CPU, for the scene that is measured beside made ones."""
     target = pack / "captures" / gpu_scenes.CAPTURE / gpu_scenes.TRAINED
     if not target.exists():
-        options = {"iterations": TRAINED_ITERATIONS, "max_gaussians": MOST_TRAINED, "densify": False}
+        options = {"iterations": TRAINED_ITERATIONS, "max_gaussians": MAX_TRAINED_GAUSSIANS, "densify": False}
         with tempfile.TemporaryDirectory() as scratch:
             made, _ = made_dataset(dataset, DENSE_POINTS, Path(scratch))
             options["max_megapixels"] = gpu_proofs.TRAINING_MP
@@ -172,7 +172,7 @@ def print_commands(pack: Path, again: bool) -> None:
     relative = os.path.relpath(pack, ROOT)
     for call, limit in (("second", 200),) if again else (("first", 420),):
         command = f"python3 benchmarks/gpu_visit.py {call} --pack {relative} --out $OUT"
-        assert len(command) < LONGEST_COMMAND
+        assert len(command) < MAX_COMMAND_LETTERS
         print(f"== the {call} call: carry {json.dumps([relative])}, timeout_s {limit}, in the repository's root:")
         print(f"   {command}")
     if not again:

@@ -40,8 +40,9 @@ MARK = "mark.cuda"  # in the source of every test that needs a device
 MIN_DB = 60.0  # between the CPU's render and the device's
 MAX_RELATIVE = 1e-3  # difference of a gradient, relative to its norm
 SSIM_WEIGHT = 0.2
-SMOKE_COUNT, SMOKE_SIZE = 20_000, (403, 299)  # of the first render; no whole tiles
-TRAINING_MP = 0.4  # of the trainings' photos
+# Gaussians and image size in pixels, not in whole tiles, of the first render.
+SMOKE_COUNT, SMOKE_SIZE = 20_000, (403, 299)
+TRAINING_MP = 0.4  # megapixels of a training photo
 
 
 class SilentReporter:

@@ -17,10 +17,10 @@ from pathlib import Path
 
 from gpu_parts import Row, read_lines
 
-MIN_DB, MAX_RELATIVE = 60.0, 1e-3  # of a render and of a gradient, beside the CPU's
+MIN_DB, MAX_RELATIVE = 60.0, 1e-3  # agreement with the CPU: PSNR of a render, relative error of a gradient
 GOALS = {"gsplat": 2.0, "faster-gs": 1.0}  # iterations a second against the peer's, at least
-GOAL_MEMORY = 0.6  # of gsplat's, at most
-MOST_APART_DB, STANDARD_ERRORS = 0.1, 2.0  # of the trainings' psnr_cc from the CPU's
+MAX_MEMORY_SHARE = 0.6  # largest memory use over gsplat's
+MAX_DIFFERENCE_DB, STANDARD_ERRORS = 0.1, 2.0  # by which a training's psnr_cc may differ from the CPU's
 CHECKS = ("memcheck", "racecheck", "synccheck", "initcheck")
 HOLDS, FAILS, MISSED, UNKNOWN = "holds", "**does not hold**", "missed (a finding)", "not measured"
 
@@ -102,19 +102,19 @@ def verdicts(record: VisitRecord) -> Iterator[Verdict]:
             yield Verdict(demand, f"{factor:.2f} times", state)
             if peer == "gsplat" and ours["peak_gb"] and theirs["peak_gb"]:
                 share = ours["peak_gb"] / theirs["peak_gb"]
-                state = HOLDS if share <= GOAL_MEMORY else MISSED
-                yield Verdict(f"≤ {GOAL_MEMORY:g} of gsplat's memory, {named(ours)}", f"{share:.2f}", state)
+                state = HOLDS if share <= MAX_MEMORY_SHARE else MISSED
+                yield Verdict(f"≤ {MAX_MEMORY_SHARE:g} of gsplat's memory, {named(ours)}", f"{share:.2f}", state)
         if not any(True for _ in pairs(record, peer)):
             yield Verdict(f"≥ {goal:g} times {peer}'s iterations", "", UNKNOWN)
     yield as_the_cpu(record)
 
 
-def judged(demand: str, values: Sequence[float], holds: object, shown: str, worst: object) -> Verdict:
+def judged(demand: str, values: Sequence[float], holds: object, number_format: str, worst: object) -> Verdict:
     """Return the verdict of the worst of some values; NaN does not hold."""
     if not values:
         return Verdict(demand, "", UNKNOWN)
     value = math.nan if any(math.isnan(each) for each in values) else worst(values)
-    return Verdict(demand, shown.format(value), HOLDS if holds(value) else FAILS)
+    return Verdict(demand, number_format.format(value), HOLDS if holds(value) else FAILS)
 
 
 def passed(record: VisitRecord, part: str, demand: str) -> Verdict:
@@ -149,7 +149,7 @@ def named(row: Row) -> str:
 
 def as_the_cpu(record: VisitRecord) -> Verdict:
     """Compare the mean psnr_cc of the trainings with the carried one of the CPU's."""
-    demand = f"psnr_cc within {MOST_APART_DB} dB + {STANDARD_ERRORS:g} standard errors of the CPU's"
+    demand = f"psnr_cc within {MAX_DIFFERENCE_DB} dB + {STANDARD_ERRORS:g} standard errors of the CPU's"
     ours = {row["seed"]: row["psnr_cc"] for row in record.rows("seed", "psnr_cc") if row["psnr_cc"] is not None}
     theirs = {row["seed"]: row["psnr_cc"] for row in record.carried if row["seed"] in ours}
     if len(theirs) < 2:
@@ -157,7 +157,7 @@ def as_the_cpu(record: VisitRecord) -> Verdict:
     both = [[values[seed] for seed in theirs] for values in (ours, theirs)]
     apart = statistics.mean(both[0]) - statistics.mean(both[1])
     error = math.sqrt(sum(statistics.variance(values) / len(values) for values in both))
-    state = HOLDS if abs(apart) <= MOST_APART_DB + STANDARD_ERRORS * error else FAILS
+    state = HOLDS if abs(apart) <= MAX_DIFFERENCE_DB + STANDARD_ERRORS * error else FAILS
     return Verdict(demand, f"{apart:+.2f} ± {error:.2f} dB of {len(theirs)} seeds", state)
 
 

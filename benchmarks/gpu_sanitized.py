@@ -31,7 +31,7 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 KERNELS = "splat4cuda"  # in the mangled name of each kernel of ours, and of no other
 SMALL, SMALL_SIZE = 3000, (161, 117)  # Gaussians, and image size: a tool slows kernels down a hundredfold
-LARGER = 1.5  # of log-scales: several tiles a Gaussian, so that a chunk of one pair each is far too small
+LOG_SCALE_INCREASE = 1.5  # added: several tiles a Gaussian, so that a chunk of one pair each is far too small
 FOUND = 3  # exit code of a run in which the tool found something
 PROBE_S = 5.0  # for a machine's refusal
 REFUSALS = ("Device not supported", "device is not supported", "not supported on")
@@ -108,7 +108,7 @@ def every_kernel(count: int = SMALL, size: Sequence[int] = SMALL_SIZE) -> Iterat
         kernels = cuda.kernels_of(where)
         assert kernels is not None
         model, view = random_model(count), view_of(*size)
-        model.log_scales += LARGER
+        model.log_scales += LOG_SCALE_INCREASE
         model = model.to(where).requires_grad_()
         for foreseen in (True, False):
             for depth in (False, True):

@@ -28,7 +28,7 @@ from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
 PACK = Path(os.environ.get("SPLATPIPE_PACK", ".gpu_visit"))
 CAPTURE = "sceaux"  # the packed capture
 TRAINED = "trained.ply"  # beside its parts: the model of a training
-MEGAPIXELS = 1.6  # of its photos
+MEGAPIXELS = 1.6  # size of a photo
 HARNESS = "SPLATPIPE_HARNESS"  # a libsplat_cuda built for the CPU, to try the parts without a GPU
 PARTS = ("undistort.dataset", "split.views", "initialize.splat", "georef.frame", "georef.control", "georef.accuracy")
 # No technique beyond plain Gaussian splatting, as in every trainer.

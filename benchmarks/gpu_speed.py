@@ -40,7 +40,7 @@ from splatpipe.pipeline.train.techniques.techniques import begin_sky, make_techn
 
 WARMUP, REPEATS = 30, 100  # iterations; the first ones determine how much room frames need
 PROFILED = 20  # iterations
-SHOWN_KERNELS = 25  # of the table
+SHOWN_KERNELS = 25  # rows of the table of kernels, the slowest ones
 COPY_BYTES = 1 << 32  # far larger than any cache
 # Minimum traffic of a whole iteration, float32: a visible Gaussian's 59 parameters and 118 moments are read and written
 # once, and the parameters read once more by the render; a pixel's colour, gradient and photo (8 bits) once each way.
@@ -49,7 +49,8 @@ BYTES_A_PIXEL = 4 * 3 * 4 + 3
 MANY_PAIRS = 1 << 31
 FOUR_K = (3840, 2160)
 COVERING = 70_000  # Gaussians covering all of a 4K image: 2.27e9 pairs with its 32,400 tiles
-ENDING = 2000  # of these, more than any pixel blends: each takes a hundredth of the light
+# Nearest Gaussians that are rendered alone: more than a pixel blends, as each takes a hundredth of the light.
+NEAREST_GAUSSIANS = 2000
 FLUSHED = 1000  # iterations of the long training between rows
 
 
@@ -261,7 +262,7 @@ def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterato
         pose = torch.eye(4, dtype=torch.float64).numpy()
         middle = {"cx": size[0] / 2, "cy": size[1] / 2, "fx": float(size[0]), "fy": float(size[0])}
         camera = Camera("4K", size[0], size[1], cam_from_world=pose, **middle)
-        nearest = Gaussians(*(tensor[:ENDING].clone() for tensor in model.tensors().values()))
+        nearest = Gaussians(*(tensor[:NEAREST_GAUSSIANS].clone() for tensor in model.tensors().values()))
         options = RenderOptions(sh_degree=0, depth=False)
         expected = rasterizer.render(nearest, camera, options).colour
         tiles = -(-size[0] // TILE_PX) * -(-size[1] // TILE_PX)

@@ -32,7 +32,8 @@ from gpu_parts import QUIET, GpuPart, PartOutcome, Row, VisitFile, read_lines, r
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRATCH = Path(tempfile.gettempdir()) / "splatpipe-gpu-visit"
-FIRST_S, SECOND_S = 414.0, 194.0  # of 420 and 200: what is left goes to the last part's end and to the table
+# Time for the parts of a call of 420 and of 200 s: the last part's end and the table take the rest.
+FIRST_S, SECOND_S = 414.0, 194.0
 IMPORTED = ("gpu_proofs", "gpu_speed", "gpu_sanitized", "gpu_peers")  # once, before the parts are forked
 SEEDS = (0, 1, 2)
 TIMED_PEERS = ("gsplat", "faster-gs")
@@ -200,7 +201,8 @@ def unpack(pack: Path) -> Row:
     os.environ["SPLATPIPE_PACK"] = str(pack.resolve())
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     os.environ.setdefault("TORCH_CUDA_ARCH_LIST", "9.0")
-    os.environ.setdefault("MAX_JOBS", str(max(1, (os.cpu_count() or 1) // 3)))  # of each peer's compilation
+    # Processes that compile a peer's extension.
+    os.environ.setdefault("MAX_JOBS", str(max(1, (os.cpu_count() or 1) // 3)))
     importlib.invalidate_caches()
     return gpu_libraries.place(pack / "libraries", packages, SCRATCH)
 

@@ -41,7 +41,7 @@ from splatpipe.stages.line import TRAIN
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.work import MEGA, CaptureSize, CaptureWork
 
-LOOK_EVERY_S = 0.5
+POLL_S = 0.5
 COLUMNS = {
     "block": "block:",
     "photos": "photos:,",
@@ -98,7 +98,7 @@ class DiskUse:
             thread.join()
 
     def _watch(self) -> None:
-        while not self._over.wait(LOOK_EVERY_S):
+        while not self._over.wait(POLL_S):
             self.most = max(self.most, _named_bytes(self._folder) + _unnamed_bytes(self._folder))
 
 

@@ -78,9 +78,9 @@ def make_capture(folder: Path, lens: BrownLens, source: BrownLens) -> None:
     calibrated = f'CalibratedFocalLength="{lens.f * WIDENED:.6f}"'.encode()
     for path in sorted((CAPTURE / "photos").glob("*.JPG")):
         photo = np.asarray(Image.open(path))
-        shown = cv2.remap(photo, *maps, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101)
+        distorted = cv2.remap(photo, *maps, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101)
         buffer = io.BytesIO()
-        Image.fromarray(shown).save(buffer, "JPEG", quality=QUALITY, subsampling=0)
+        Image.fromarray(distorted).save(buffer, "JPEG", quality=QUALITY, subsampling=0)
         whole = path.read_bytes()
         assert whole.count(FOCAL_TEXT) == 1 and len(calibrated) == len(FOCAL_TEXT)
         metadata = b"".join(_metadata(whole)).replace(FOCAL_TEXT, calibrated)

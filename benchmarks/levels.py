@@ -38,7 +38,7 @@ from splatpipe.pipeline.splat.model.scene import Scene
 SHARES = (50, 25, 10, 5)  # percent
 ERROR_PX = 16.0
 GREY = (0.5, 0.5, 0.5)
-SIDE, FOCAL = 384, 800.0  # of the nodes' images, pixels
+SIDE, FOCAL = 384, 800.0  # image side and focal length of a node's view, pixels
 FINER = 4  # times as many pixels along each side: nearly the true scene
 MIN_COVERED = 60  # pixels: fewer say nothing
 FRAMES = 48
@@ -120,7 +120,7 @@ def equal_counts(scene: Scene, cameras: Sequence[Camera], source: Path, command:
         print(f"{share} %, {count:,}: {likeness(reduced):.2f} dB in {seconds:.0f} s{theirs}", flush=True)
 
 
-def look(place: np.ndarray, target: np.ndarray, focal: float, width: int, height: int) -> Camera:
+def aimed_camera(place: np.ndarray, target: np.ndarray, focal: float, width: int, height: int) -> Camera:
     """Return an upright camera at a place, looking at a target."""
     ahead = (target - place) / np.linalg.norm(target - place)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -161,7 +161,7 @@ def node_errors(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> Non
             towards = camera.centre() - middle
             towards /= np.linalg.norm(towards)
             place = place_at(node, middle, towards, node.error * FOCAL / ERROR_PX)
-            view = look(place, middle, FOCAL, SIDE, SIDE)
+            view = aimed_camera(place, middle, FOCAL, SIDE, SIDE)
             picture, ours = (drawn(gaussians, view, antialias) for gaussians in (full, node.gaussians))
             covered = picture.alpha > 0.5
             if int(covered.sum()) >= MIN_COVERED:
@@ -187,7 +187,7 @@ def way_through(scene: Scene, root: LevelNode, cameras: Sequence[Camera]) -> Non
     worst_dB, worst_jump, holes, chosen_counts = math.inf, 0.0, 0, []
     for step in range(FRAMES):
         times = FARTHEST ** (1.0 - step / (FRAMES - 1))
-        view = look(target + ray * times, target, photo.fx, photo.width, photo.height)
+        view = aimed_camera(target + ray * times, target, photo.fx, photo.width, photo.height)
         chosen = Gaussians.concat([n.gaussians for n in select_nodes(root, view.centre(), view.fx, ERROR_PX)])
         chosen_counts.append(len(chosen))
         one, other = drawn(scene.gaussians, view, scene.facts.antialias), drawn(chosen, view, scene.facts.antialias)

@@ -252,7 +252,7 @@ def prepare(
         photos: Number of photos, the first in name order; None for all.
         start: How the points become Gaussians.
     """
-    whole = folder / "whole"  # the same under the pipeline's names
+    whole = folder / "whole"  # the whole data set, its parts linked under the pipeline's names
     whole.mkdir(parents=True)
     for link, target in ((IMAGES, IMAGES), ("masks", "masks"), ("sparse", points)):
         if (data / target).is_dir():
@@ -351,7 +351,7 @@ def machine(threads: int) -> Row:
     """Describe the machine that the figures were measured on, with its ceilings."""
     facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": rasterizer.isa_name(), "isas": _native.isas()}
     facts |= {"system": f"{platform.system()} {platform.release()}", "versions": versions()}
-    facts["load_average"] = os.getloadavg()[0]  # of the minute before: well above 0, the machine was not idle
+    facts["load_average"] = os.getloadavg()[0]  # mean of the last minute: well above 0, the machine was not idle
     return facts | measure_ceilings(threads)
 
 

@@ -31,11 +31,11 @@ from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 
-SLOW_S = 5.0  # of CPU time
+SLOW_S = 5.0  # CPU time above which reading a file counts as slow
 WORKER = Path(__file__).with_name("read_worker.py")
 HANG_S = 60.0  # wall-clock time, on a shared machine
 MAX_BYTES = 500_000_000
-LARGEST_SAMPLE = 8 << 20  # a larger file is not used as a sample: reading thousands of it takes hours
+MAX_SAMPLE_BYTES = 8 << 20  # a larger file is not used as a sample: reading thousands of it takes hours
 BY_CONTENT = 4  # every n-th file must first be recognised by its content
 ENDS = ("read", "refused", "crashed", "unsound", "slow", "memory")
 COLUMNS = {
@@ -121,7 +121,7 @@ def foreign_samples(splat_format: SplatFormat, folder: Path) -> list[Sample]:
         if path.is_dir():
             name = Path(splat_format.file).name
             found.append(_sample(splat_format, path, name if (path / name).exists() else ""))
-        elif path.stat().st_size <= LARGEST_SAMPLE:
+        elif path.stat().st_size <= MAX_SAMPLE_BYTES:
             found.append(Sample(splat_format, path.name, {path.name: path.read_bytes()}))
     return found
 

@@ -45,7 +45,7 @@ KERNELS = ((f"{NATIVE}/*/*.cpp", 2), (f"{NATIVE}/cuda/*.cu*", 2))
 UNTESTABLE = ("bind_", "sbom", "options.py", "__init__.py")  # glue, defaults
 TEXT_CHECKS = ("test_every_version_matches_the_present_sources", "test_every_name_imported")
 NEAREST = 6  # test files that a mutation meets alone
-TIMEOUT_S = 300  # of a test: a mutation may make a loop endless
+TIMEOUT_S = 300  # time limit of a test: a mutation may make a loop endless
 NO_TESTS = 5  # pytest's exit code
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 COMPARED = {ast.Lt: ">=", ast.GtE: "<", ast.Gt: "<=", ast.LtE: ">", ast.Eq: "!=", ast.NotEq: "=="}

@@ -50,12 +50,12 @@ from splatpipe.pipeline.render.consistency import AGREEMENT
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, of coded values
 EVERY_PX = 3  # spacing of the pixels that are followed into the next frame, both ways
 NEAREST = 0.02  # quantile of the sparse points' depths: a few points are wrong
-IN_THE_AIR = 0.5  # of the nearest points' depth: the sparse cloud has holes, but none so deep
-LARGEST_IN_THE_AIR = 0.01  # share of a frame: more counts as a crossing floater
+MIN_DEPTH_SHARE = 0.5  # share of the nearest points' depth: the sparse cloud has holes, but none so deep
+MAX_IN_THE_AIR_SHARE = 0.01  # share of a frame: more counts as a crossing floater
 MUCH_NEARER = 0.7  # times the smaller median depth of the two neighbouring photos
 SHEET_COLUMNS, SHEET_FRAMES, SHEET_WIDTH = 6, 48, 300
 FPS = 25
-SHOWN = 8  # frames in the table; all are in the JSON
+TABLE_FRAMES = 8  # frames in the table; all are in the JSON
 
 COLUMNS = {
     "frame": "frame:",
@@ -127,11 +127,11 @@ class SceneClearance:
         self.seen = [points.xyz[tracks[camera.name]] for camera in cameras]
         self.medians = [_median(run.median_depth(camera)) for camera in cameras]
 
-    def look(self, frame: PathFrame, index: int) -> Row:
+    def clearance_row(self, frame: PathFrame, index: int) -> Row:
         """Return how near a frame's content is, between photo ``index`` and the next."""
         points = np.vstack(self.seen[index : index + 2])
         _, _, z = frame.camera.in_view(points)
-        limit = IN_THE_AIR * float(np.quantile(z, NEAREST)) if z.size else 0.0
+        limit = MIN_DEPTH_SHARE * float(np.quantile(z, NEAREST)) if z.size else 0.0
         photos = [median for median in self.medians[index : index + 2] if median is not None]
         median = _median(frame.depth)
         return {
@@ -191,7 +191,7 @@ def measure_path(run: OpenedRun, cameras: Sequence[Camera], frames: int, folder:
         row: Row = {"frame": number, "between": names, "luminance": float((frame.pixels @ LUMA).mean())}
         if before is not None:
             row |= {"step": row["luminance"] - rows[-1]["luminance"]} | change(before, frame)
-        rows.append(row | surroundings.look(frame, index))
+        rows.append(row | surroundings.clearance_row(frame, index))
         write_png(folder / f"frame_{number:04d}.png", frame.pixels)
         height = max(1, round(SHEET_WIDTH * camera.height / camera.width))
         small.append(np.asarray(cv2.resize(frame.pixels, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)))
@@ -209,7 +209,7 @@ def summary(rows: Sequence[Row]) -> Row:
     crossing = [
         row["frame"]
         for row in rows
-        if row["in_the_air"] > LARGEST_IN_THE_AIR or (row["depth_ratio"] or math.inf) < MUCH_NEARER
+        if row["in_the_air"] > MAX_IN_THE_AIR_SHARE or (row["depth_ratio"] or math.inf) < MUCH_NEARER
     ]
     return {
         "frames": len(rows),
@@ -244,7 +244,7 @@ def main() -> None:
         options.exit(error.exit_code, f"{error.message} {error.hint}\n")
     result = summary(rows)
     worst = sorted(rows, key=lambda row: max(abs(row.get("exposure", 0.0)), 100.0 * row["in_the_air"]), reverse=True)
-    print_table("the frames that stand out most", worst[:SHOWN], COLUMNS)
+    print_table("the frames that stand out most", worst[:TABLE_FRAMES], COLUMNS)
     print("\n".join(f"{name.replace('_', ' ')}: {_text(value)}" for name, value in result.items()))
     text = json.dumps({"summary": result, "frames": rows}, indent=1)
     (arguments.save / "path_frames.json").write_text(text + "\n", encoding="utf-8")

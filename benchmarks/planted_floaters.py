@@ -30,7 +30,7 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.quality.metrics import psnr, psnr_cc
 
 ASKED_FOUND, MAX_LOST, MAX_LOSS_DB = 0.95, 0.005, 0.05
-DEPTH_MEGAPIXELS = 0.07  # of the renders that locate surfaces
+DEPTH_MEGAPIXELS = 0.07  # size of a render that locates surfaces
 
 KIND_COLUMNS = {"kind": "kind:", "planted": "planted:,", "found": "found:,", "share": "share:.4f", "bars": "bars:"}
 LOSS_COLUMNS = {

@@ -20,7 +20,7 @@ from splatpipe.pipeline.splat.model.scene import Scene
 SITE_M = 3000.0
 MAX_POINTS = 30_000  # number that are matched
 BESIDE = 20.0  # steps: a larger distance means another Gaussian, or an error of the format
-HALF = 0.5 + 1e-3  # of a step: rounding to nearest, plus float32 along the way
+MAX_ERROR_STEPS = 0.5 + 1e-3  # largest error in steps of the format: rounding to nearest, plus float32 along the way
 
 Points = Float64[np.ndarray, "n 3"]
 
@@ -60,7 +60,7 @@ def position_row(original: Scene, read: Scene, path: Path, name: str) -> Row:
         "largest_mm": 1e3 * float(errors.max()),
         "in_steps": float((errors / steps).max()),
         "brought_in": int((~beside).sum()),
-        "within": bool((errors <= HALF * steps + _float_steps(in_file[beside])).all()),
+        "within": bool((errors <= MAX_ERROR_STEPS * steps + _float_steps(in_file[beside])).all()),
     }
 
 

@@ -26,19 +26,20 @@ FAULTS = ("none", "wrong", "no fix", "datum", "too small", "too large")
 STRIPS, PER_STRIP, ALONG, ACROSS = 6, 8, 0.8, 0.7  # photos, and their overlaps
 HEIGHT_M, FOCAL_PX, SIZE_PX = 44.0, 1920.0, (1600, 1300)
 APART_M, RELIEF_M = 8.0, 5.0  # between the heights of alternating strips; of the hills, from foot to top
-STEADY_M, TILT_DEG = np.array([0.2, 0.2, 0.1]), 0.5  # of the aircraft about its plan
-TIES, TIE_PX = 150, 1.0  # of a photo, and their noise
+# Standard deviations of the aircraft's place and tilt about its plan.
+STEADY_M, TILT_DEG = np.array([0.2, 0.2, 0.1]), 0.5
+TIES_PER_PHOTO, TIE_PX = 150, 1.0  # tie points per photo, and standard deviation of their noise
 CANDIDATES = 5000
-WIDEST = 0.9  # tangent of a ray's angle up to which the lens is drawn
+MAX_RAY_TANGENT = 0.9  # tangent of a ray's angle up to which the lens is drawn
 MATCHED = math.cos(math.radians(30.0))  # a point is matched among rays that differ by less
 GRAZING = math.cos(math.radians(72.0))
 HOUSE_M, GARDEN_M = np.array([6.0, 4.5, 7.0]), 25.0  # half length, half width, height
 NEAR_M, FAR_M = 5.0, 40.0
-WHITE_M, DRIFT_M = np.array([0.01, 0.01, 0.018]), np.array([0.01, 0.01, 0.018])  # of positions
+WHITE_M, DRIFT_M = np.array([0.01, 0.01, 0.018]), np.array([0.01, 0.01, 0.018])  # position noise
 DRIFT, COMMON_M = 0.9, np.array([0.01, 0.01, 0.015])  # correlation from photo to photo; what a flight shares
 STATED_M = np.array([0.014, 0.014, 0.021])
 LENS_SPREAD = {"f": 0.01, "c": 20.0, "k": 0.02, "p": 0.001}  # about the stated one: relative, pixels, and as they are
-START_M, START_DEG = 0.05, 0.1  # of the cameras before the adjustment
+START_M, START_DEG = 0.05, 0.1  # standard deviations of the cameras' errors before the adjustment
 WRONG_SHARE, WRONG_M, NO_FIX_M, NO_FIX_DRIFT, DATUM_M = 0.1, (0.3, 5.0), 0.5, 0.98, 47.0
 
 
@@ -170,12 +171,12 @@ def _observed(
     normals: Float64[np.ndarray, "p 3"],
     rng: np.random.Generator,
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 2"]]:
-    """The first points that give the photos ``TIES`` each; photo, point and exact pixel of what shows them."""
+    """The first points that give the photos ``TIES_PER_PHOTO`` each; photo, point and exact pixel of each."""
     ways = points[:, None] - centres  # (p, n, 3)
     rays = np.einsum("nij,pnj->pni", rotations, ways)
     away = np.linalg.norm(ways, axis=2)
     units = ways / away[..., None]
-    seen = (rays[..., 2] > 1.0) & (np.hypot(rays[..., 0], rays[..., 1]) < WIDEST * rays[..., 2])
+    seen = (rays[..., 2] > 1.0) & (np.hypot(rays[..., 0], rays[..., 1]) < MAX_RAY_TANGENT * rays[..., 2])
     seen &= (away > NEAR_M) & (away < 2.0 * FAR_M) & (-np.einsum("pna,pa->pn", units, normals) > GRAZING)
     pixels = np.full((*seen.shape, 2), np.nan)
     pixels[seen] = np.asarray(camera.img_from_cam(rays[seen]), np.float64)
@@ -185,7 +186,7 @@ def _observed(
         near = np.einsum("pna,pa->pn", units, units[np.arange(len(points)), home]) > MATCHED
         seen &= near & (away < FAR_M)
     seen[seen.sum(axis=1) < 3] = False
-    enough = int(np.searchsorted(np.cumsum(seen.sum(axis=1)), TIES * len(centres)))
+    enough = int(np.searchsorted(np.cumsum(seen.sum(axis=1)), TIES_PER_PHOTO * len(centres)))
     rows = np.flatnonzero(seen[:enough].any(axis=1))
     point, photo = np.nonzero(seen[rows])
     return rows, photo, point, pixels[rows][point, photo]

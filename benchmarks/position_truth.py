@@ -36,8 +36,8 @@ from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
 CONTROL_M = np.array([0.02, 0.02, 0.03])
 MARK_PX = 0.5
-ONE_AT, THREE_AT = ((0.0, 0.0),), ((-0.6, -0.6), (0.6, -0.4), (0.0, 0.6))  # of half the ground's extent
-WEAK_M = 100.0  # of positions that only hold the frame
+ONE_POINT, THREE_POINTS = ((0.0, 0.0),), ((-0.6, -0.6), (0.6, -0.4), (0.0, 0.6))  # half extents of the ground
+WEAK_SIGMA_M = 100.0  # standard deviation of positions that only hold the frame
 FAULTY = ("flat", "alternating")
 AXES = "ENU"
 
@@ -106,8 +106,8 @@ def told_noise(scene: Scene) -> PositionObservations:
     share = (DRIFT_M**2 / size**2)[[0, 2]]
     noise = as_stated(positions)
     drifts = np.tile(share, (len(noise.classes), 1)), np.full_like(factors, DRIFT)
-    told = PositionNoise(noise.classes, noise.of, factors, factors, *drifts)
-    return replace(told.observations(positions), offset_sigmas=COMMON_M[None])
+    stated_noise = PositionNoise(noise.classes, noise.of, factors, factors, *drifts)
+    return replace(stated_noise.observations(positions), offset_sigmas=COMMON_M[None])
 
 
 def with_control(block: Block, scene: Scene, places: tuple[tuple[float, float], ...], seed: int) -> Block:
@@ -141,7 +141,7 @@ def todays_errors(scene: Scene) -> list[float]:
     camera: pycolmap.Camera = scene.stated
     lens = prior_lens(camera, LensKnowledge(float(camera.params[0]), 0.1), SIMPLE)
     positions = scene.positions
-    weak = as_stated(replace(positions, sigmas=np.full_like(positions.sigmas, WEAK_M))).observations(positions)
+    weak = as_stated(replace(positions, sigmas=np.full_like(positions.sigmas, WEAK_SIGMA_M))).observations(positions)
     free = adjust_block(replace(scene.block, lenses=(lens,)), weak).block
     similarity = Similarity(*fit_similarity(free.centres, positions.stated, np.ones(len(positions))))
     return ((similarity.apply(free.points) - scene.points) ** 2).mean(axis=0).tolist()
@@ -166,7 +166,7 @@ def measure(name: str, fault: str, seed: int) -> Row:
         return row
     observed = told_noise(scene)
     row["told"] = compared(accuracy_of(adjust_block(fit.adjusted.block, observed), observed), scene)
-    for key, places in (("one", ONE_AT), ("three", THREE_AT)):
+    for key, places in (("one", ONE_POINT), ("three", THREE_POINTS)):
         block = with_control(fit.adjusted.block, scene, places, seed)
         controlled = converge(block, scene.positions, fit.kept)
         row[key] = compared(accuracy_of(controlled.adjusted, controlled.observed), scene)

@@ -24,7 +24,7 @@ from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.model.scene import Scene
 
-SPARE_BYTES = 2 << 30  # of address space above current use: reserved but unused memory does not count, up to a limit
+SPARE_BYTES = 2 << 30  # address space above current use: reserved but unused memory does not count, up to a limit
 STATUS = Path("/proc/self/status")
 
 Reader = Callable[[Path], Scene]

@@ -40,9 +40,9 @@ from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
 BLOCKS = ("flat", "alternating")
-HALF_M, TEXEL_M = 62.0, 0.0165  # of the painted ground
+HALF_M, TEXEL_M = 62.0, 0.0165  # half side of the painted ground, and size of its texels
 PATHS = 6  # a pixel
-BYTES = 900_000  # of a photo
+MEAN_PHOTO_BYTES = 900_000  # mean size of a photo's file
 PAUSE_S = 3
 SENSOR_MM, FULL_FRAME_MM = 17.3, 43.27  # width of the camera model's sensor, and diagonal of 35 mm film
 AGREED_GSDS = 3.0
@@ -120,7 +120,7 @@ def write_photos(scene: Scene, work: Path, seed: int) -> Path:
     places = origin.geodetic(scene.positions.stated)
     stated = {"RtkStdLon": STATED_M[0], "RtkStdLat": STATED_M[1], "RtkStdHgt": STATED_M[2]}
     calibrated = {"CalibratedFocalLength": f"{scene.stated.params[0]:.6f}"}
-    for number, (pose, jpeg) in enumerate(zip(poses, compress(developed, BYTES * len(poses)), strict=True)):
+    for number, (pose, jpeg) in enumerate(zip(poses, compress(developed, MEAN_PHOTO_BYTES * len(poses)), strict=True)):
         taken = (start + timedelta(seconds=PAUSE_S * number)).strftime("%Y:%m:%d %H:%M:%S")
         position = GpsPosition(*(float(x) for x in places[number]))
         angles = {"GimbalRollDegree": "+0.00", "GimbalYawDegree": f"{pose.yaw_deg:+.2f}", "GimbalPitchDegree": "-90.00"}

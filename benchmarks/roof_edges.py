@@ -17,11 +17,11 @@ SMOOTH_PX = 0.7  # sigma of the blur before edges are searched: suppresses the n
 ALONG_PX = 2.0  # between places on the outline
 TRUE_WITHIN_PX = 0.75  # largest distance of the true image's strongest edge from the outline
 MIN_STEP = 12.0  # grey levels per pixel: a roof that looks like its surroundings has no measurable edge
-MIN_SHARE = 0.3  # of the true edge's strength: anything weaker counts as missing
+MIN_SHARE = 0.3  # least strength of an edge over the true edge's: anything weaker counts as missing
 OUTSTANDING = 1.5  # times the strongest other true edge along the line
-SAME_PX = 2.5  # within this distance it is the same edge
+MAX_EDGE_OFFSET_PX = 2.5  # within this distance it is the same edge
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-OUTLINE_SIGMA_PX = 2.0  # of the mask's blur, from which the border's direction and subpixel position are computed
+OUTLINE_SIGMA_PX = 2.0  # blur of the mask from which the border's direction and subpixel position are computed
 
 
 def outline(roofs: Bool[np.ndarray, "h w"]) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]:
@@ -65,7 +65,7 @@ def visible_edges(strength: Float32[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"
     offsets = _offsets()
     best = strength.argmax(axis=1)
     peak = strength.max(axis=1)
-    other = np.where(np.abs(offsets[None] - offsets[best][:, None]) > SAME_PX, strength, 0.0).max(axis=1)
+    other = np.where(np.abs(offsets[None] - offsets[best][:, None]) > MAX_EDGE_OFFSET_PX, strength, 0.0).max(axis=1)
     on_line = np.abs(offsets[best]) <= TRUE_WITHIN_PX
     return np.asarray(on_line & (peak >= MIN_STEP) & (peak >= OUTSTANDING * other))
 

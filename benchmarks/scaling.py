@@ -66,8 +66,8 @@ COLUMNS = {
 }
 CALIBRATED = 0.02  # tolerance, relative to the target pairs per pixel
 CALIBRATIONS = 8  # iterations at most: the blur prevents a million Gaussians from covering less of a small image
-LONGEST_STEP = 1.5
-MEMORY_START = 0.9  # of the cap: density control then grows to it
+MAX_STEP = 1.5
+INITIAL_SHARE = 0.9  # initial Gaussians over their cap: density control then grows to it
 MEMORY_ITERATIONS = 4
 
 
@@ -97,7 +97,7 @@ def sized(gaussians: Gaussians, cameras: Sequence[Camera], plan: TrainingPlan, w
         if abs(found / wanted - 1.0) < CALIBRATED:
             break
         # The area grows with the square of the size; steps are limited so that the next one still has pairs to measure.
-        gaussians.log_scales += max(-LONGEST_STEP, min(LONGEST_STEP, 0.5 * math.log(wanted / max(found, 1e-3))))
+        gaussians.log_scales += max(-MAX_STEP, min(MAX_STEP, 0.5 * math.log(wanted / max(found, 1e-3))))
     return gaussians
 
 
@@ -124,7 +124,7 @@ def stage_case(case: TimingCase) -> Row:
     """Run the whole training stage for a few iterations, with density control up to the cap and checkpoints."""
     before = restart_peak()
     start = Path(case.splat)
-    cap = round(read_splat_header(start).count / MEMORY_START)
+    cap = round(read_splat_header(start).count / INITIAL_SHARE)
     config = TrainConfig(
         iterations=MEMORY_ITERATIONS,
         max_gaussians=cap,
@@ -142,7 +142,7 @@ def stage_case(case: TimingCase) -> Row:
     wall, cpu = time.perf_counter(), time.process_time()
     summary = train.run(config, Inputs(parts, out, machine=Machine("cpu", case.threads)), out, SilentReporter())
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    grown = summary["gaussians"] > MEMORY_START * cap
+    grown = summary["gaussians"] > INITIAL_SHARE * cap
     if not (grown and (out / loop.CHECKPOINT).exists()):
         raise SystemExit("The stage left no checkpoint, or did not grow: its peak would say too little.")
     shutil.rmtree(out)
@@ -208,7 +208,7 @@ def run_case(
     dataset = folder / f"{megapixels}"
     if not dataset.exists():
         prepare(arguments.data, "sparse", size_factor(arguments.data, megapixels), dataset, arguments.photos)
-    begun_with = round(MEMORY_START * count) if memory else count
+    begun_with = round(INITIAL_SHARE * count) if memory else count
     start = write_start(dataset, begun_with, arguments.pairs, arguments.threads)
     case = TimingCase(str(dataset), str(start), threads, arguments.repeats, warmup=arguments.photos)
     row = {"megapixels": megapixels} | run_apart([__file__, *(["--stage"] if memory else [])], case)

@@ -107,13 +107,13 @@ def judged(place: SeamScene, splat: Gaussians, border: Border) -> Iterator[Row]:
     facts: Row = {"border": f"{border.blocks[0]}–{border.blocks[1]}", "length": border.line.length * place.metres}
     seams = place.seams(splat, border.line)
     for seam in seams:
-        shown = seam.response
-        row = {"found": seam.kind, "measure": f"{shown.measure}, {2 * shown.width} px", "size": shown.size}
+        response = seam.response
+        row = {"found": seam.kind, "measure": f"{response.measure}, {2 * response.width} px", "size": response.size}
         yield (
             facts
             | row
             | {
-                "score": shown.score,
+                "score": response.score,
                 "start": seam.start * place.metres,
                 "end": seam.end * place.metres,
             }

@@ -24,15 +24,14 @@ from splatpipe.demo.visibility import MIN_VIEWS, photos_that_see
 from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
 
 TOLERANCE_GSD = 2.0  # for clouds and meshes
-SAMPLES = 100_000  # of the true surface and of a product: the standard deviation of a share is below 0.002
+SAMPLES = 100_000  # points on the true surface and on a product: the standard deviation of a share is below 0.002
 SPACING_M = 0.05  # between samples on the true surface
 SEED = 18
 TARGET_REACH_PX = 32  # half-size of the search window; a target is some 18 px
 FOUND_PX = 12.0  # a detection farther off is another target, or false
 SEEN_M = 0.05  # a target this far below the visible surface is hidden
-WALL_M = (
-    0.5  # in front of or behind a wall's plane, what belongs to it: reveals, sills, frames, steps at the roof's edge
-)
+# In front of or behind a wall's plane, what belongs to it: reveals, sills, frames, steps at the roof's edge.
+WALL_M = 0.5
 SAME_NORMAL = 0.9  # cosine between a façade's normal and its wall's
 SAME_WALL_M = 2.0  # largest distance between their planes
 WALL_PARTS = (HOUSE, PLAIN, BRICKS)

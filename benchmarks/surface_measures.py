@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64, UInt8
 from tables import Row
 
 NMAD_OF_MAD = 1.4826  # MAD to standard deviation for normal errors (Höhle and Höhle, 2009)
-LARGEST = 255.0  # of a colour channel
+MAX_CHANNEL_VALUE = 255.0  # largest value of a colour channel
 MOVED_LIMIT = 1e3  # dB: for identical images
 
 
@@ -89,7 +89,7 @@ def psnr(
     """Return the PSNR over the pixels that count, dB; the image must be black where it is empty."""
     apart = picture[counts].astype(np.float64) - truth[counts]
     mean = float(np.square(apart).mean())
-    return MOVED_LIMIT if mean == 0.0 else 10.0 * math.log10(LARGEST**2 / mean)
+    return MOVED_LIMIT if mean == 0.0 else 10.0 * math.log10(MAX_CHANNEL_VALUE**2 / mean)
 
 
 def fitted_colours(
@@ -100,7 +100,7 @@ def fitted_colours(
     for channel in range(3):
         known = np.stack([picture[counts, channel].astype(np.float64), np.ones(int(counts.sum()))], axis=1)
         gain, offset = np.linalg.lstsq(known, truth[counts, channel].astype(np.float64), rcond=None)[0]
-        result[..., channel] = np.clip(picture[..., channel] * gain + offset + 0.5, 0.0, LARGEST)
+        result[..., channel] = np.clip(picture[..., channel] * gain + offset + 0.5, 0.0, MAX_CHANNEL_VALUE)
     return result
 
 

@@ -21,7 +21,7 @@ from splatpipe.demo.relief import Relief, surface_model
 from splatpipe.demo.truth import Triangles, centre, true_poses, true_surface
 from splatpipe.demo.visibility import MIN_VIEWS, TrueView, photos_that_see, true_views
 
-GSD_M = 0.028  # of the original photos, at the house
+GSD_M = 0.028  # ground sample distance of the original photos at the house
 STEP_M = 4.0 * GSD_M  # more than roofs (slope 0.9) rise between cells of 2 GSD; chimneys, dormers and walls are higher
 STEP_CELLS = 2
 ROOF_UP = 0.5  # upward component of a roof's normal: 60°

@@ -27,7 +27,7 @@ from splatpipe.pipeline.surface.heights.heights import HeightInput, surface_heig
 from splatpipe.pipeline.surface.ortho.orthophoto import TILE, OrthoInput, orthophotos
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 
-GSD_M = 0.028  # of the original photos, at the house
+GSD_M = 0.028  # ground sample distance of the original photos at the house
 HALF_M = 9.0  # half the side of the part
 RELIEF = HeightRange(-2.0, 14.0)
 CACHE_BYTES = 1 << 30

@@ -138,36 +138,40 @@ def draw(photo: Floats, pattern: Pattern, homography: Floats, levels: tuple[Floa
     return result
 
 
-def blur_kernel(look: TargetAppearance, rng: np.random.Generator) -> Floats:
+def blur_kernel(appearance: TargetAppearance, rng: np.random.Generator) -> Floats:
     """Return a kernel of defocus and motion, one sample per pixel."""
-    size = int(2 * np.ceil(3 * look.defocus_px[1] + look.motion_px) + 1)
+    size = int(2 * np.ceil(3 * appearance.defocus_px[1] + appearance.motion_px) + 1)
     fine = np.zeros((size * SAMPLES, size * SAMPLES))
-    middle, length, angle = size * SAMPLES / 2, rng.uniform(0, look.motion_px) * SAMPLES, rng.uniform(0, np.pi)
+    middle, length, angle = size * SAMPLES / 2, rng.uniform(0, appearance.motion_px) * SAMPLES, rng.uniform(0, np.pi)
     along = np.linspace(-length / 2, length / 2, 41)
     # The bilinear weights keep the mean at the centre: the blur does not shift the image.
     for at_x, at_y in zip(middle - 0.5 + along * np.cos(angle), middle - 0.5 + along * np.sin(angle), strict=True):
         ix, iy = int(np.floor(at_x)), int(np.floor(at_y))
         fx, fy = at_x - ix, at_y - iy
         fine[iy : iy + 2, ix : ix + 2] += np.outer([1 - fy, fy], [1 - fx, fx])
-    fine = cv2.GaussianBlur(fine, (0, 0), rng.uniform(*look.defocus_px) * SAMPLES)
+    fine = cv2.GaussianBlur(fine, (0, 0), rng.uniform(*appearance.defocus_px) * SAMPLES)
     kernel = fine.reshape(size, SAMPLES, size, SAMPLES).sum(axis=(1, 3))
     return np.asarray(kernel / kernel.sum())
 
 
 def render(
-    photo: Bytes, kinds: list[tuple[str, Pattern]], look: TargetAppearance, rng: np.random.Generator, apart_px: float
+    photo: Bytes,
+    kinds: list[tuple[str, Pattern]],
+    appearance: TargetAppearance,
+    rng: np.random.Generator,
+    apart_px: float,
 ) -> tuple[Bytes, list[RenderedTarget]]:
     """Return a photo with one target of each kind at random places, and the targets."""
     height, width = photo.shape[:2]
     canvas, placed = photo.astype(np.float64), []
-    border = 2.0 * look.sizes_px[1] + 4.0
+    border = 2.0 * appearance.sizes_px[1] + 4.0
     for name, pattern in kinds:
         centre = _place(placed, (width, height), border, apart_px, rng)
-        size = float(np.exp(rng.uniform(*np.log(look.sizes_px))))
-        homography = plane_to_photo(centre, size, look.tilt_deg, rng)
+        size = float(np.exp(rng.uniform(*np.log(appearance.sizes_px))))
+        homography = plane_to_photo(centre, size, appearance.tilt_deg, rng)
         light = rng.uniform(0.5, 1.0)  # in sunlight or in shade
         levels = (light * rng.uniform(15, 60) * _tint(rng), light * rng.uniform(180, 245) * _tint(rng))
-        canvas = draw(canvas, pattern, homography, levels, blur_kernel(look, rng))
+        canvas = draw(canvas, pattern, homography, levels, blur_kernel(appearance, rng))
         corners = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]) @ homography.T
         corners = corners[:, :2] / corners[:, 2:]
         where = homography[:, 2] / homography[2, 2]
@@ -175,10 +179,10 @@ def render(
         placed.append(
             RenderedTarget((float(where[0]), float(where[1])), float(np.sqrt(_area(corners))), float(thin), name)
         )
-    canvas = 255.0 * np.clip(canvas / 255.0 * 2.0 ** (rng.uniform(*look.exposures_ev) / 2.2), 0, 1)
-    canvas += rng.normal(0.0, rng.uniform(0, look.noise), canvas.shape)
+    canvas = 255.0 * np.clip(canvas / 255.0 * 2.0 ** (rng.uniform(*appearance.exposures_ev) / 2.2), 0, 1)
+    canvas += rng.normal(0.0, rng.uniform(0, appearance.noise), canvas.shape)
     done = np.clip(np.rint(canvas), 0, 255).astype(np.uint8)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(*look.quality))]
+    quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(*appearance.quality))]
     data = cv2.imencode(".jpg", np.ascontiguousarray(done[:, :, ::-1]), quality)[1]
     return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[:, :, ::-1]), placed
 

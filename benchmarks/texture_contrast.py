@@ -30,7 +30,7 @@ TEXTURES = {"bricks": BRICK, "tiles": TILES, "slates": SLATE}
 BANDS = {"1-2 px": (0.5, 1.0), "2-4 px": (1.0, 2.0), "4-8 px": (2.0, 4.0), "all": (0.0, 4.0)}
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 EDGE_PX = 6  # from the border of a surface: blurs reach across it
-FEWEST_PIXELS = 500  # of a texture in a view
+MIN_PIXELS = 500  # fewest pixels of a texture in a view that is judged
 SAME_DEPTH = 1e-4  # relative: a few millimetres, less than targets stand out from walls
 COLUMNS = {"run": "run:", "texture": "texture:", "pixels": "pixels:,"} | {
     f"{band} {what}": f"{band} {what}:.2f" for band in BANDS for what in ("contrast", "slope")
@@ -82,7 +82,7 @@ def measure(run: OpenedRun, megapixels: float, save: Path | None) -> list[Row]:
 
 def figures(samples: list[tuple[Pixels, Pixels, Bool[np.ndarray, "h w"]]]) -> Row:
     """Return contrast and slope of each band, over the pixels of all views with enough of the texture."""
-    samples = [sample for sample in samples if sample[2].sum() >= FEWEST_PIXELS]
+    samples = [sample for sample in samples if sample[2].sum() >= MIN_PIXELS]
     row: Row = {"pixels": int(sum(mask.sum() for _, _, mask in samples))}
     for name, (low, high) in BANDS.items() if samples else ():
         x, y = (np.concatenate([_centred(band(s[k], low, high)[s[2]]) for s in samples]) for k in (0, 1))

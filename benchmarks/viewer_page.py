@@ -55,8 +55,10 @@ def write_page(run: OpenedRun, count: int, folder: Path) -> None:
     """Write a page that embeds a model with that many Gaussians."""
     gaussians, sky = run.model
     frame = load_frame(run.parts["georef.frame"].path)
-    look = viewer_rendering(run.options, sky)
-    scene = viewer_scene(run.parts["undistort.dataset"].path, frame, look, run.held_out, count, f"{count:,} Gaussians")
+    rendering = viewer_rendering(run.options, sky)
+    scene = viewer_scene(
+        run.parts["undistort.dataset"].path, frame, rendering, run.held_out, count, f"{count:,} Gaussians"
+    )
     write_viewer(folder, scene, in_world(multiplied(gaussians, count), frame), largest_bytes=1e9)
 
 

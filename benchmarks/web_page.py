@@ -31,7 +31,7 @@ from splatpipe.pipeline.web.site import write_site
 from splatpipe.pipeline.web.viewer_scene import viewer_rendering, viewer_scene, write_viewer
 
 SITE, PAGE = "web", "viewer.html"
-PATIENCE_S = 420.0
+TIMEOUT_S = 420.0
 
 
 def main() -> None:
@@ -65,8 +65,10 @@ def write_pages(run: OpenedRun, count: int, folder: Path) -> None:
     """Write a site and a page of a model with that many Gaussians."""
     gaussians, sky = run.model
     frame = load_frame(run.parts["georef.frame"].path)
-    look = viewer_rendering(run.options, sky)
-    scene = viewer_scene(run.parts["undistort.dataset"].path, frame, look, run.held_out, count, f"{count:,} Gaussians")
+    rendering = viewer_rendering(run.options, sky)
+    scene = viewer_scene(
+        run.parts["undistort.dataset"].path, frame, rendering, run.held_out, count, f"{count:,} Gaussians"
+    )
     many = in_world(multiplied(gaussians, count), frame)
     folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
@@ -76,7 +78,7 @@ def write_pages(run: OpenedRun, count: int, folder: Path) -> None:
     root = build_levels(many)
     print(f"levels: {time.perf_counter() - began:.0f} s")
     began = time.perf_counter()
-    write_site(folder / SITE, scene, Scene(many, SceneFacts("z up", antialias=look.antialias)), root)
+    write_site(folder / SITE, scene, Scene(many, SceneFacts("z up", antialias=rendering.antialias)), root)
     print(f"site: {time.perf_counter() - began:.0f} s")
 
 
@@ -129,7 +131,7 @@ class PageVisit:
         width, height = (int(side) for side in size.split("x"))
         phone = width <= 640
         context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
-        context.set_default_timeout(1e3 * PATIENCE_S)
+        context.set_default_timeout(1e3 * TIMEOUT_S)
         self._page = context.new_page()
         self._traffic = Traffic()
 

@@ -70,7 +70,7 @@ class TimedTraining:
         state: Its state.
         photos: Photos of its iterations.
         cpu_s: CPU seconds of each iteration.
-        counted: Pixels in the loss, in total.
+        loss_pixels: Pixels in the loss, in total.
         rendered: Pixels rendered, in total.
         pairs: Pairs that the rasterizer blended, in total.
     """
@@ -81,7 +81,7 @@ class TimedTraining:
     state: TrainState
     photos: PhotoStream
     cpu_s: list[float] = field(default_factory=list)
-    counted: int = 0
+    loss_pixels: int = 0
     rendered: int = 0
     pairs: int = 0
 
@@ -93,7 +93,7 @@ class TimedTraining:
         self.cpu_s.append(time.process_time() - began)
         size = photo.camera.width * photo.camera.height
         left, top, right, bottom = photo.inner or (0, 0, photo.camera.width, photo.camera.height)
-        self.counted += (right - left) * (bottom - top)
+        self.loss_pixels += (right - left) * (bottom - top)
         self.rendered += size
         self.pairs += contributing_pairs(self.state.gaussians, photo.camera, self.plan, self.state.iteration)
 
@@ -107,27 +107,27 @@ class TimedTraining:
             "seen": self.name,
             "gaussians": len(self.state.gaussians),
             "iterations": turns,
-            "counted_megapixels": 1e-6 * self.counted / turns,
+            "counted_megapixels": 1e-6 * self.loss_pixels / turns,
             "rendered_megapixels": 1e-6 * self.rendered / turns,
             "cpu_s": median,
             "cpu_mean_s": mean,
             "pairs_per_pixel": self.pairs / self.rendered,
             "ratio": ratio,
             "mean_ratio": mean_ratio,
-            "ratio_per_counted": mean_ratio * whole.counted / self.counted,
+            "ratio_per_counted": mean_ratio * whole.loss_pixels / self.loss_pixels,
         }
 
 
 def begin(
-    dataset: Path, start: Gaussians, looks: list[TrainingSize], threads: int
+    dataset: Path, start: Gaussians, sizes: list[TrainingSize], threads: int
 ) -> tuple[TrainingPlan, TrainState, PhotoStream]:
     """Start a training with fixed Gaussians and the rates of a long run, photos decoded and sky detected."""
     views = load_views(dataset)
     config = TrainConfig(iterations=PUBLISHED_ITERATIONS, max_gaussians=10**9, exposure="affine")
     plan = make_plan(config, views, Split(tuple(view.camera.name for view in views)), len(start))
-    if len(looks) >= plan.schedule.density.first:
-        raise SystemExit(f"{len(looks)} iterations reach density control; take fewer repeats.")
-    photos = PhotoStream.over(views, looks, 0, 1, dataset)
+    if len(sizes) >= plan.schedule.density.first:
+        raise SystemExit(f"{len(sizes)} iterations reach density control; take fewer repeats.")
+    photos = PhotoStream.over(views, sizes, 0, 1, dataset)
     photos.fill(SilentReporter())
     with same_bits(threads):
         sky = begin_sky(config, views, dataset, threads, SilentReporter())
@@ -144,8 +144,8 @@ def measure(arguments: argparse.Namespace, folder: Path) -> list[Row]:
             dataset = prepare(arguments.data, arguments.points, factor, folder / str(megapixels), arguments.photos)
             start = read_splat(folder / str(arguments.window) / "init.ply")
             is_whole = megapixels == arguments.window
-            looks = [TrainingSize(0, 0 if is_whole else window)] * (WARMUP + arguments.repeats)
-            plan, state, photos = begin(dataset, start, looks, arguments.threads)
+            sizes = [TrainingSize(0, 0 if is_whole else window)] * (WARMUP + arguments.repeats)
+            plan, state, photos = begin(dataset, start, sizes, arguments.threads)
             name = "whole" if is_whole else "in windows"
             runners.append(TimedTraining(name, megapixels, plan, state, open_streams.enter_context(photos)))
         with same_bits(arguments.threads):

@@ -44,7 +44,7 @@ class BrownLens:
         return not (self.k2 or self.k3 or self.p1 or self.p2)
 
     def scaled(self, factor: float) -> BrownLens:
-        """The same lens for photos of another size."""
+        """This lens for photos of another size."""
         return replace(
             self,
             width=round(self.width * factor),
@@ -85,10 +85,9 @@ class BrownLens:
 
 # The Zenmuse P1 with 35 mm, from Pix4D's camera database: for rays up to 0.6 off the axis.
 P1_CORNER, P1_RADIAL, P1_TANGENTIAL = 0.6007, (-0.047957, 0.0205183, -0.0972836), (0.00179669, -0.00139674)
-BROWN_TIMES = (
-    2.0  # SIMPLE_RADIAL then errs by 3.8 px RMS and 14 px at most at the demo's size, as for the P1 at its own
-)
-BROWN_OFFSET_PX = (16.0, -12.0)  # of the principal point: 20 px
+# SIMPLE_RADIAL then errs by 3.8 px RMS and 14 px at most at the demo's size, as for the P1 at its own.
+BROWN_TIMES = 2.0
+BROWN_OFFSET_PX = (16.0, -12.0)  # principal point from the image's centre: 20 px
 
 
 def brown_lens(simple: BrownLens | None = None) -> BrownLens:

@@ -35,7 +35,7 @@ BASELINE_RANK = 4  # rank by distance of the neighbouring photo whose baseline d
 NOISE_REACH_PX = 1.5  # sigma of the noise's correlation, as matching windows of some 7 pixels produce it
 HOLES, HOLE_REACH_PX = 0.10, 6.0
 OUTLIERS, OUTLIER_REACH_PX = 0.02, 2.0
-OUTLIER_SHARE = (0.6, 1.6)  # of the true depth
+OUTLIER_SHARE = (0.6, 1.6)  # an outlier's depth over the true depth, from and to
 CONFIRMED = 0.7  # share of the photos that see a place which confirm a noisy depth
 UNLIMITED_MEGAPIXELS = 1e6
 

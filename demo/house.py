@@ -26,7 +26,7 @@ CLADDING = planks(("7a5a3c", "8d6b49", "6b4c33", "a07d56"))
 TILES = roof_tiles(("8f5340", "a2634a", "7d4a3c", "b27a5c", "6f4438", "9c6e58"))
 SLATE = roof_tiles(("59616b", "6b727a", "4a515c", "7d8388", "66605f"))
 METAL = painted("6f7274", 0.8)
-SHEET = mottled(("7c8a80", "8f9a8c", "69756d", "9ba394"), 1.6, 0.15, 0.07)  # of the annex
+SHEET = mottled(("7c8a80", "8f9a8c", "69756d", "9ba394"), 1.6, 0.15, 0.07)  # roof of the annex
 WOOD = planks(("6a4a30", "7d5a3a", "5a3d28"), 0.14, 1.5)
 
 

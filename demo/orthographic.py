@@ -23,7 +23,7 @@ from .scene import build_scene, turned
 from .sensor import GAIN, WHITE_BALANCE, coded
 
 PIXEL_M = 0.014  # half of the photos' GSD
-TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # of the top view; nothing in it is higher
+TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # half side and height of the top view; nothing in it is higher
 # Distance that a façade is viewed from: beyond annex, eaves and steps, but nearer than trees and the van in the south.
 AHEAD_M = {"south": 4.0, "north": 5.5, "west": 5.5, "east": 5.5}
 MARGIN_M = 0.3  # around a wall

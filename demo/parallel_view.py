@@ -47,6 +47,6 @@ class ParallelView:
         return np.asarray(places @ axes + self.origin)
 
     def resampled(self, pixel_m: float) -> ParallelView:
-        """The same view with another pixel size."""
+        """This view with another pixel size."""
         width, height = (round(count * self.pixel_m / pixel_m) for count in (self.width, self.height))
         return replace(self, pixel_m=pixel_m, width=width, height=height)

@@ -225,7 +225,7 @@ def _garden(b: Builder) -> None:
         b.box(WORLD, (-1.9, y + 0.05, 0.0), (-0.1, y + 0.3, 0.38), planks(("6a4a30",)))
     for k, (x, y) in enumerate([(2.6, 9.4), (3.6, 9.4), (-4.7, 9.6), (3.9, -6.0), (-0.9, -6.1)]):
         b.box(WORLD, (x, y, 0.0), (x + 0.55, y + 0.55, 0.5), painted(("a0533a", "6f7a82", "8a7a5a")[k % 3], 1.0))
-        _lump(b, (x + 0.27, y + 0.27, 0.75), (0.38, 0.38, 0.4), 300 + k, ("maple", "birch", "oak")[k % 3], 4)
+        _foliage(b, (x + 0.27, y + 0.27, 0.75), (0.38, 0.38, 0.4), 300 + k, ("maple", "birch", "oak")[k % 3], 4)
     for k in range(3):  # bins
         b.box(
             WORLD,
@@ -273,15 +273,15 @@ def _borders(b: Builder) -> None:
         b.box(WORLD, (17.0, start, 0.05), (17.06, start + 2.42, 1.6), FENCE)
         b.box(WORLD, (16.96, start - 0.1, 0.0), (17.1, start, 1.75), FENCE)
     for k, y in enumerate(np.arange(-12.5, 16.0, 4.6)):  # hedge
-        _lump(b, (-17.0, y, 0.75), (0.75, 2.45, 1.0), 400 + k, "oak", 5, 8.0)
+        _foliage(b, (-17.0, y, 0.75), (0.75, 2.45, 1.0), 400 + k, "oak", 5, 8.0)
     for k, x in enumerate(np.arange(-14.5, 16.0, 4.8)):
-        _lump(b, (x, 17.2, 0.8), (2.55, 0.8, 1.1), 430 + k, "oak" if k % 2 else "birch", 5, 8.0)
+        _foliage(b, (x, 17.2, 0.8), (2.55, 0.8, 1.1), 430 + k, "oak" if k % 2 else "birch", 5, 8.0)
 
 
 BRICK_POST = bricks(("8d4a34", "a2593d", "b56e4b", "7a3d2e"), "b5aa9a", 0.25, 0.125)
 
 
-def _lump(
+def _foliage(
     b: Builder,
     centre: tuple[float, float, float],
     radii: tuple[float, float, float],
@@ -310,7 +310,7 @@ def _tree(b: Builder, x: float, y: float, height: float, seed: int, leaves: str,
         planks(("5c4a38", "6f5a44", "4a3a2c")),
         painted("5c4a38"),
     )
-    _lump(b, (x, y, ground + height - crown), (0.30 * height, 0.30 * height, crown), seed, leaves, n)
+    _foliage(b, (x, y, ground + height - crown), (0.30 * height, 0.30 * height, crown), seed, leaves, n)
     if n >= 8:
         for k in range(2):
             turn = rng.uniform(0, 2 * np.pi)
@@ -319,7 +319,7 @@ def _tree(b: Builder, x: float, y: float, height: float, seed: int, leaves: str,
                 y + 0.17 * height * np.sin(turn),
                 ground + height * rng.uniform(0.48, 0.6),
             )
-            _lump(b, at, (0.22 * height, 0.22 * height, 0.2 * height), seed + 50 + k, leaves, n - 3)
+            _foliage(b, at, (0.22 * height, 0.22 * height, 0.2 * height), seed + 50 + k, leaves, n - 3)
 
 
 def _trees(b: Builder) -> None:
@@ -344,7 +344,7 @@ def _trees(b: Builder) -> None:
         (-9.2, -12.8, 0.8),
     ]
     for k, (x, y, r) in enumerate(bushes):
-        _lump(b, (x, y, 0.7 * r), (r, r, 0.9 * r), 700 + k, ("birch", "oak", "maple")[k % 3], 5)
+        _foliage(b, (x, y, 0.7 * r), (r, r, 0.9 * r), 700 + k, ("birch", "oak", "maple")[k % 3], 5)
     rng = np.random.default_rng(11)
     for k in range(46):
         turn, r = 2 * np.pi * (k + rng.uniform(0, 0.8)) / 46, rng.uniform(38, 88)

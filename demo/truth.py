@@ -72,7 +72,8 @@ def depth_map(camera: Camera, triangles: Triangles) -> Float64[np.ndarray, "h w"
         across, down = x[left:right], y[top:bottom, None]
         weights = [(u * across + (v * down + w)) / det for u, v, w in edges]
         inside = (weights[0] >= 0.0) & (weights[1] >= 0.0) & (weights[2] >= 0.0)
-        total = weights[0] + weights[1] + weights[2]  # of a point at depth 1
+        # 1/z: the sum of the corners' weights for the pixel's ray at depth 1.
+        total = weights[0] + weights[1] + weights[2]
         inside &= total > 0.0
         there = depth[top:bottom, left:right]
         np.minimum(there, 1.0 / np.where(inside, total, 1.0), out=there, where=inside)

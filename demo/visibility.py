@@ -15,7 +15,7 @@ from splatpipe.demo.truth import Triangles, depth_map
 from splatpipe.pipeline.geometry.camera import Camera
 
 BEHIND_M = 0.03  # tolerance by which a photo's depth may be less than a visible place's: less than half a pixel's slant
-MIN_COSINE = 0.087  # of 85°: at flatter angles, a surface is seen as a line
+MIN_COSINE = 0.087  # cosine of 85°: at flatter angles, a surface is seen as a line
 HALF = 2  # divisor of the photos' size for computed depths
 MIN_VIEWS = 3  # photos that determine a place's position with redundancy
 

@@ -18,7 +18,7 @@ from splatpipe.pipeline.train.plan.lengths import Length, PhotoSizes, growth_unt
 from splatpipe.pipeline.train.plan.limits import PIXEL_BYTES, bytes_per_gaussian
 
 PHOTOS_PER_POINT = 35.0  # photos that show a point: about 12 in a nadir flight, 60 in the tiled demo, which has orbits
-VISIBLE_SHARE = 3.0  # of the site that a block sees, over its share of the photos: 3.6 and 2.4 in the tiled demo
+VISIBLE_SHARE = 3.0  # share of the site that a block sees, over its share of the photos: 3.6 and 2.4 in the tiled demo
 START_S = 5.0  # CPU seconds per block before its first iteration: libraries, its photos' exposures and skies
 LAYOUT_S = 0.07  # CPU seconds per pair of photo and visible block, to find its surroundings; from the tiled demo
 DENSIFY_EVERY = 100  # iterations between two density-control steps, unless the training is short

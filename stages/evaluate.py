@@ -33,7 +33,7 @@ from splatpipe.pipeline.splat.sky.panorama import read_panorama
 
 Pictures = tuple[tuple[Camera, Pixels, Mask | None], Pixels, Path, Mask | None]  # view, render, stem, inside mask
 
-MEASURED_TOGETHER = 4  # views, each with 0.3 GB of images in double precision
+PARALLEL_VIEWS = 4  # views, each with 0.3 GB of images in double precision
 
 
 def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -72,7 +72,7 @@ def run(config: EvaluateConfig, inputs: Inputs, out: Path, report: Reporter) -> 
     per_view: list[dict[str, Any]] = []
     cameras = [reduced_camera(view.camera, JUDGED_MEGAPIXELS) for view in views]
     with same_bits(inputs.machine.threads):
-        for found in ordered_map(_measure, pictures(), min(inputs.machine.threads, MEASURED_TOGETHER)):
+        for found in ordered_map(_measure, pictures(), min(inputs.machine.threads, PARALLEL_VIEWS)):
             per_view.append(found)
             report.progress(len(per_view), len(chosen), "measuring held-out photos", "photos")
         floaters = measure_floaters(gaussians, cameras, judged, inputs["undistort.dataset"], options, area)

@@ -95,10 +95,10 @@ def run(config: ExportConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     (out / "formats").mkdir()
     sizes: dict[str, int] = {}
     if config.viewer_megabytes > 0.0 or config.formats:
-        shown = viewer_of(inputs, gaussians, config.title)
+        viewer = viewer_of(inputs, gaussians, config.title)
         if config.viewer_megabytes > 0.0:
-            write_viewer(out / "viewer", shown, gaussians, config.viewer_megabytes * 1e6)
-        run = RunSplat(Scene(gaussians, facts), frame, dataset, cameras, points, held_out_names(inputs), placed, shown)
+            write_viewer(out / "viewer", viewer, gaussians, config.viewer_megabytes * 1e6)
+        run = RunSplat(Scene(gaussians, facts), frame, dataset, cameras, points, held_out_names(inputs), placed, viewer)
         sizes = write_deliverables(parse_formats(config.formats), run, out / "formats", report)
     report.progress(4, 4, "writing the viewer", "files")
     summary: dict[str, Any] = {name: figures[name] for name in ("gaussians", "registered", "photos", "psnr", "ssim")}
@@ -115,9 +115,9 @@ def viewer_of(inputs: Inputs, gaussians: Gaussians, title: str) -> ViewerScene:
         title: The page's title.
     """
     options, _ = as_trained(inputs["train.rendering"], gaussians)
-    look = viewer_rendering(options, read_panorama(inputs["train.sky"]))
+    rendering = viewer_rendering(options, read_panorama(inputs["train.sky"]))
     frame = load_frame(inputs["georef.frame"])
-    scene = viewer_scene(inputs["undistort.dataset"], frame, look, held_out_names(inputs), len(gaussians), title)
+    scene = viewer_scene(inputs["undistort.dataset"], frame, rendering, held_out_names(inputs), len(gaussians), title)
     if (area := read_world_area(inputs.parts.get("georef.boundary"))) is not None:
         scene = replace(scene, focus=area.contains(scene.points))
     return scene

@@ -31,11 +31,11 @@ from splatpipe.pipeline.train.plan.limits import (
 from splatpipe.stages.block_work import START_S, BlockLoad
 from splatpipe.stages.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import FEWEST_GAUSSIANS, MEGA, MIN_SHARE, CaptureSize, CaptureWork
+from splatpipe.stages.work import MEGA, MIN_GAUSSIANS, MIN_SHARE, CaptureSize, CaptureWork
 
 SPEED_NUMBERS = 20_000  # in the text, without repeats, whose compression is timed
 SPEED_S = 0.008  # seconds of that compression on the reference machine of `costs.py`, otherwise idle
-SPEED_LEVEL = 6  # of compression
+SPEED_LEVEL = 6  # zlib's compression level when the machine's speed is measured
 SPEED_TRIES = 5  # the fastest counts: the others were slowed by other processes
 SPEED_RANGE = (0.25, 4.0)  # measurements are clamped to it
 
@@ -82,7 +82,7 @@ def needs_of(work: CaptureWork, speed: float) -> dict[str, Need]:
 
 def min_memory_bytes(config: LineConfig) -> int:
     """Smallest memory limit that training can keep: libraries, the smallest window, the fewest Gaussians."""
-    model = FEWEST_GAUSSIANS * bytes_per_gaussian(config.train.sh_degree)
+    model = MIN_GAUSSIANS * bytes_per_gaussian(config.train.sh_degree)
     return LIBRARIES_BYTES + FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + model
 
 

@@ -95,8 +95,8 @@ def choose_points(points: Points, usable: npt.NDArray[np.int64], limit: int) -> 
     """
     if usable.size <= limit:
         return usable
-    ranked = np.lexsort((usable, points.errors_px[usable], -points.track_lengths[usable].astype(np.int64)))
-    return np.sort(usable[ranked[:limit]])
+    order = np.lexsort((usable, points.errors_px[usable], -points.track_lengths[usable].astype(np.int64)))
+    return np.sort(usable[order[:limit]])
 
 
 def point_sizes(xyz: Doubles, centres: Doubles, max_angle: float, report: Reporter | None = None) -> Doubles:

@@ -21,7 +21,8 @@ SOURCES = {"photos": (True, False), "splat": (False, True), "both": (True, True)
 USUAL = "ortho,dsm"
 
 NO_PRODUCTS: dict[str, Any] = {stage: {"enabled": False} for stage in ("depths", *NEEDS)}
-PRODUCTS_FROM_BUDGET_S = 3600.0  # of the whole run; a shorter one is spent on the splat, and products can be made later
+# Least time for a whole run with products; a shorter one is spent on the splat, and they can be made later.
+PRODUCTS_FROM_BUDGET_S = 3600.0
 
 
 def parse_products(text: str) -> tuple[str, ...]:

@@ -67,8 +67,8 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     _warn(summary, report)
     report_cameras(summary["cameras"], report)
     report_lenses(summary, report)
-    counted = {key: len(summary[key]) for key in ("unregistered", "other_models", "alike")}
-    return {**summary, **counted}
+    counts = {key: len(summary[key]) for key in ("unregistered", "other_models", "alike")}
+    return {**summary, **counts}
 
 
 def _capture(inputs: Inputs, scratch: Path) -> MappingInput:

@@ -17,7 +17,7 @@ from splatpipe.pipeline.survey.placing.model import read_model
 from splatpipe.pipeline.survey.targets.expected_places import Window, expected_windows
 from splatpipe.pipeline.survey.targets.target_finds import QUADRANT, TargetFind, load_wanted, save_finds
 
-COVERED = 0.8  # radius around a coded target, over its size, in which quadrants are ignored
+COVERED_RADIUS_SHARE = 0.8  # radius around a coded target, over its size, in which quadrants are ignored
 
 
 def run(config: TargetsConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -59,6 +59,6 @@ def _found_in(item: tuple[Photo, Window], part: Path, photos_dir: Path) -> list[
     finds += [
         TargetFind(photo.name, QUADRANT, None, t.x + left, t.y + top, t.size_px, t.sigma_px)
         for t in find_quadrant_targets(pixels)
-        if all(max(abs(t.x + left - f.x), abs(t.y + top - f.y)) > COVERED * f.size_px for f in finds)
+        if all(max(abs(t.x + left - f.x), abs(t.y + top - f.y)) > COVERED_RADIUS_SHARE * f.size_px for f in finds)
     ]
     return finds

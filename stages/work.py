@@ -44,21 +44,21 @@ NEIGHBOURS = 20  # per photo, behind `Costs.pairs`
 PHOTOS_OF_ONE_COST = 50  # up to this many photos, mapping costs the constant per photo; with more photos it costs more
 MAPPING_GROWTH = 0.75  # exponent of the number of photos in the mapping cost per photo: seneca's 167, a room's 292
 WITHOUT_POSITIONS = 2.5  # times the mapping cost: pairs that only look alike, doubts, second mappings
-STRONGER_MEGAPIXELS = 4.3  # of an image in which photos that were not placed get further keypoints
-STRONGER_BYTES = 250.0  # of memory per pixel of these, on half of the threads
+REEXTRACTION_MEGAPIXELS = 4.3  # size of an image in which unplaced photos get further keypoints
+REEXTRACTION_BYTES = 250.0  # memory per pixel for these keypoints, on half of the threads
 JUDGED_ONE_IN = 8  # photos, behind the cost of `evaluate`
 PREVIEW_STEPS = 5  # density-control steps behind `Costs.gaussians`
 STEPS_POWER = 1.3  # exponent of Gaussians over steps: 1.5 on brighton (946,000 at `standard`), 0.9 on the demo
 SIZE_POWER = 0.5  # exponent of Gaussians over photo size: from 0.1 to 0.3 megapixels on the demo
 PREVIEW_MEGAPIXELS = 0.3  # training size behind `Costs.gaussians`
 GAUSSIAN_MEGAPIXELS = 1.7e-6  # that cost as much per iteration as a Gaussian: 1.2 on seneca, 2.3 on brighton (894,000)
-UNSEEN_SHARE = 0.3  # of a Gaussian's cost that remains outside the window; an estimate
-GROWTH_SAMPLES = 32  # of the number of Gaussians within a stretch of the training
+UNSEEN_SHARE = 0.3  # share of a Gaussian's cost that remains outside the window; an estimate
+GROWTH_SAMPLES = 32  # points at which the growing number of Gaussians is averaged over a stretch of the training
 PYRAMID = 4.0 / 3.0  # pixels of a photo's whole image pyramid over its own
 TARGETS_TILE = 2.4  # megapixels of a tile in which targets are searched
-START_SHARE = 0.2  # of the final number of Gaussians, at the start
-MIN_SHARE = 0.1  # of a time budget that training always gets
-FEWEST_GAUSSIANS = 1000  # however short the time
+START_SHARE = 0.2  # initial over final number of Gaussians
+MIN_SHARE = 0.1  # least share of a time budget that training gets
+MIN_GAUSSIANS = 1000  # however short the time
 PHOTO_BYTES = 3  # per decoded pixel
 PARALLEL = {
     "ingest": 0.8,
@@ -216,7 +216,7 @@ class CaptureWork:
         cpu = seconds / Need(0, 1.0, 0, parallel=PARALLEL["train"]).seconds(self.threads)
         bare = replace(longer, gaussians=0.0).training
         room = cpu * speed / self.costs.stages["train"].cpu - bare
-        fitting = max(FEWEST_GAUSSIANS, room / (replace(longer, gaussians=1.0).training - bare))
+        fitting = max(MIN_GAUSSIANS, room / (replace(longer, gaussians=1.0).training - bare))
         return replace(longer, gaussians=min(self.most_gaussians, longer.grown, fitting))
 
     @property
@@ -242,9 +242,11 @@ class CaptureWork:
         return min(every, self.costs.pairs * photos * options.neighbours / NEIGHBOURS)
 
     @property
-    def stronger_bytes(self) -> float:
+    def reextraction_bytes(self) -> float:
         """Memory for further keypoints in photos that mapping could not place, which may be none."""
-        return STRONGER_BYTES * MEGA * min(self.size.megapixels, STRONGER_MEGAPIXELS) * max(1, self.threads // 2)
+        return (
+            REEXTRACTION_BYTES * MEGA * min(self.size.megapixels, REEXTRACTION_MEGAPIXELS) * max(1, self.threads // 2)
+        )
 
     @property
     def judged_photos(self) -> int:
@@ -373,7 +375,7 @@ class CaptureWork:
             "control": WorkUnits(controlled, 0.0, controlled),
             "features": WorkUnits(looked, looked_at_once, keypoints),
             "matches": WorkUnits(self.pairs * self.keypoints, float(self.threads), keypoints),
-            "sparse": WorkUnits(photos * mapping, math.sqrt(photos), keypoints, self.stronger_bytes),
+            "sparse": WorkUnits(photos * mapping, math.sqrt(photos), keypoints, self.reextraction_bytes),
             "targets": WorkUnits(controlled * pixels, controlled * targets_at_once, controlled * photos),
             "georef": WorkUnits(photos, keypoints, keypoints),
             "undistort": WorkUnits(pixels, at_once, photos * self.dataset_megapixels),

@@ -43,8 +43,8 @@ def tables() -> str:
             name = f"{section}.{option}"
             default = field.get_default(call_default_factory=True)
             others = [(preset, lookup(config, name)) for preset, config in presets.items()]
-            differing = "; ".join(f"{preset} {shown(value)}" for preset, value in others if value != default)
-            cells = (f"`{name}`", kind(field), shown(default), differing, texts[name])
+            differing = "; ".join(f"{preset} {value_text(value)}" for preset, value in others if value != default)
+            cells = (f"`{name}`", kind(field), value_text(default), differing, texts[name])
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         sections.append("\n".join(lines))
     return "\n\n".join(sections) + "\n"
@@ -55,7 +55,7 @@ def kind(field: FieldInfo) -> str:
     return " or ".join(_kinds(field.annotation, field.metadata))
 
 
-def shown(value: Any) -> str:
+def value_text(value: Any) -> str:
     """Format a value as after ``--set``."""
     if value == "":
         return "empty"

@@ -22,7 +22,7 @@ SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
 PLACES = ("x", "y", "z")
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
-LARGEST = 1e9  # of a coordinate, metres: larger ones are not on the earth, and a chart's steps are lost in rounding
+MAX_COORDINATE_M = 1e9  # metres: larger coordinates are not on the earth, and a chart's steps are lost in rounding
 
 
 def update_viewer(out: Path) -> str:
@@ -43,10 +43,10 @@ def update_viewer(out: Path) -> str:
     pages = [name for name in own if (out / name).is_file()]
     if not pages or not has_measurements(out):
         return ""
-    shown, trouble = shown_measurements(out), ""
+    measurements, trouble = displayed_measurements(out), ""
     for name in pages:
         try:
-            _update(out / name, shown)
+            _update(out / name, measurements)
         except ValueError:
             trouble = (
                 f"{name} was written by an earlier version and cannot show measurements; update it with: "
@@ -55,10 +55,10 @@ def update_viewer(out: Path) -> str:
     return trouble
 
 
-def _update(path: Path, shown: Mapping[str, Any] | None) -> None:
+def _update(path: Path, measurements: Mapping[str, Any] | None) -> None:
     """Put measurements into a page without changing its mtime; a page that already shows them is left alone."""
     page = path.read_bytes()
-    updated = with_measurements(page, shown)
+    updated = with_measurements(page, measurements)
     if updated == page:
         return
     stamp = path.stat()
@@ -71,7 +71,7 @@ def _update(path: Path, shown: Mapping[str, Any] | None) -> None:
     write_durably(path, fill)
 
 
-def shown_measurements(out: Path) -> dict[str, Any] | None:
+def displayed_measurements(out: Path) -> dict[str, Any] | None:
     """The measurements to show: those of the current surface model, in the page's frame. None if there are none."""
     from splatpipe.stages.line import DSM, EXPORT, LINE  # here: every run ends in this module, whatever its pipeline
 
@@ -117,7 +117,9 @@ def _has_columns(trace: Any, names: Sequence[str]) -> bool:
     if not isinstance(trace, dict) or not all(isinstance(trace.get(name), list) for name in names):
         return False
     if not all(
-        value is None or (is_number(value) and abs(value) <= LARGEST) for name in names for value in trace[name]
+        value is None or (is_number(value) and abs(value) <= MAX_COORDINATE_M)
+        for name in names
+        for value in trace[name]
     ):
         return False
     return len({len(trace[name]) for name in names}) == 1

@@ -20,7 +20,7 @@ MEASURED = Path("stages/measured.json")
 SECTIONS = "sections"  # the folder in OUT
 VOLUMES = "volumes.json"
 FORMAT = 1
-LARGEST_FILE = 64 << 20  # bytes: ten times the largest file ever written
+MAX_FILE_BYTES = 64 << 20  # bytes: ten times the largest file ever written
 Kind = Literal["sections", "volumes"]
 Items = list[dict[str, Any]]
 FIGURES: Mapping[Kind, Sequence[str]] = {
@@ -111,7 +111,7 @@ def is_number(value: Any) -> bool:
 def _stored(out: Path) -> dict[str, Any]:
     path = out / MEASURED
     try:
-        value = read_json(path, LARGEST_FILE)
+        value = read_json(path, MAX_FILE_BYTES)
     except (OSError, ValueError):
         return {}
     return value if isinstance(value, dict) and value.get("format") == FORMAT else {}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SYSTEM = ("dev", "proc", "sys")  # the same on every machine, and needed to understand messages about them
+SYSTEM = ("dev", "proc", "sys")  # folders identical on every machine, and needed to understand messages about them
 # A folder's name in a text. It may have single blanks, unless a path begins after one, and pairs of brackets; what
 # remains unclear is taken as part of the path: a word too few is better than a customer's name.
 _FOLDER = (
@@ -22,7 +22,7 @@ _FOLDERS = (
     rf"(?<![\w./~-])~?/(?!(?:{'|'.join(SYSTEM)})\b)(?:{_FOLDER}/+)+",  # in the file system, also from ~
     rf"(?<![\w./-])(?:\.\./)+(?:{_FOLDER}/+)*",
     rf"(?<![\w+.-])(?!https?:)[A-Za-z][\w+.-]+://[^\s/]*/*(?:{_FOLDER}/+)*",  # smb://, file://, …
-    rf"(?<!\w)[A-Za-z]:[\\/]+(?:{_FOLDER}[\\/]+)*",  # of Windows
+    rf"(?<!\w)[A-Za-z]:[\\/]+(?:{_FOLDER}[\\/]+)*",  # Windows paths with a drive
     rf"(?<![\w\\/])\\\\+{_FOLDER}\\+(?:{_FOLDER}[\\/]+)*",  # a Windows server's
 )
 _ELSEWHERE = re.compile("|".join(_FOLDERS))
@@ -58,8 +58,8 @@ class PathLabels:
         if "/" not in text and "\\" not in text:
             return text
         for path, name in self.names:
-            shown = rf"{_escape_backslashes(name)}\1" if name else ""
-            text = re.sub(rf"(?<![\w.-]){re.escape(path)}(?![\w-])(/?)", shown, text)
+            replacement = rf"{_escape_backslashes(name)}\1" if name else ""
+            text = re.sub(rf"(?<![\w.-]){re.escape(path)}(?![\w-])(/?)", replacement, text)
         return _ELSEWHERE.sub("", text)
 
     def plain_value(self, value: Any) -> Any:

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 MAX_SECTIONS = 100
 UNFINISHED = ".sections.making"
 SECTION_FILE = re.compile(r"section-\d+(_points)?\.(csv|dxf|png)")
-SECTION_PLACES = 2000  # most points in a section's trace: more than a chart has pixels
-ALL_PLACES = 60_000  # most points in all traces together: they add at most 3 MB to a page
-RING_PLACES = 400  # most points in a polygon's ring
-TRACED_VOLUMES = 200  # most volumes in pages; any more are only in volumes.json
+MAX_SECTION_POINTS = 2000  # most points in a section's trace: more than a chart has pixels
+MAX_TRACE_POINTS = 60_000  # most points in all traces together: they add at most 3 MB to a page
+MAX_RING_POINTS = 400  # most points in a polygon's ring
+MAX_TRACED_VOLUMES = 200  # most volumes in pages; any more are only in volumes.json
 Base = Literal["rim", "lowest"] | float
 Line = tuple[float, float, float, float]
 
@@ -183,7 +183,7 @@ def measure_surface(out: Path, wanted: MeasurementRequest, threads: int) -> dict
     surface = _open_surface(out)
     measured: dict[str, Any] = {}
     aside = out / UNFINISHED
-    shutil.rmtree(aside, ignore_errors=True)  # of a killed command
+    shutil.rmtree(aside, ignore_errors=True)  # a killed command may have left it
     try:
         aside.mkdir()
         sections = _sections(surface, wanted.lines, aside, threads)
@@ -229,7 +229,7 @@ def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threa
         return []
     maps = list_depth_maps(surface.parts["depths.maps"].path, load_views(surface.parts["undistort.dataset"].path))
     sources = metric_depths(maps, surface.frame.world_from_model)
-    most = min(SECTION_PLACES, ALL_PLACES // len(lines))
+    most = min(MAX_SECTION_POINTS, MAX_TRACE_POINTS // len(lines))
     found = []
     for number, line in enumerate(lines, 1):
         section = cut_section(surface.model, line, surface.crs, sources, threads)
@@ -261,8 +261,8 @@ def _volumes(surface: _SurfaceModel, wanted: MeasurementRequest) -> Items:
         return []
     drawing = read_boundary(wanted.polygons)
     area = placed_area(drawing, surface.frame)
-    rings = sum(len(polygon) for polygon in area.polygons[:TRACED_VOLUMES])
-    most = max(4, min(RING_PLACES, ALL_PLACES // rings))
+    rings = sum(len(polygon) for polygon in area.polygons[:MAX_TRACED_VOLUMES])
+    most = max(4, min(MAX_RING_POINTS, MAX_TRACE_POINTS // rings))
     uncertainty = surface.frame.residuals.get("uncertainty") or {}  # absent if control points georeference the run
     datum_sigma_m = float(uncertainty.get("offset_sigma_m", (0.0,))[-1])
     found: Items = []
@@ -270,7 +270,7 @@ def _volumes(surface: _SurfaceModel, wanted: MeasurementRequest) -> Items:
         alone = PlanArea(area.axes, (polygon,))
         volume = measure_volume(surface.model, alone, surface.crs, wanted.base, datum_sigma_m)
         facts = volume_facts(number, name, volume)
-        if number <= TRACED_VOLUMES:
+        if number <= MAX_TRACED_VOLUMES:
             facts["trace"] = polygon_trace(surface.model, polygon, surface.crs, most)
         found.append(facts)
     return found

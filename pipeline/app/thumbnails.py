@@ -16,8 +16,8 @@ from PIL import Image, ImageOps
 from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.photos.files.picture_file import open_picture, sparse_data_reason, turn_to_decode
 
-MAX_BYTES = 512 << 20  # of a file
-MAX_PIXELS = 300_000_000  # of a photo that cannot be reduced while decoding: about a gigabyte of memory
+MAX_BYTES = 512 << 20  # largest file that is read
+MAX_PIXELS = 300_000_000  # largest photo decoded if it cannot be reduced meanwhile: about a gigabyte of memory
 END_OF_JPEG = b"\xff\xd9"
 QUALITY = 76
 TURNS = {  # by EXIF orientation

@@ -29,8 +29,8 @@ HOSTS = ("splatpipe-one", "splatpipe-two")  # the nodes' names
 CONFIGURATION = Path("/etc/slurm")
 GROUPS = Path("/sys/fs/cgroup")
 CLUSTER = "splatpipe"
-PATIENCE_S = 60.0
-CONTROLLERS = ("memory", "cpuset", "freezer")  # of control groups version 1, as far as Slurm uses them
+TIMEOUT_S = 60.0
+CONTROLLERS = ("memory", "cpuset", "freezer")  # control groups of version 1 that Slurm uses
 PORTS = {"mariadb": 0, "slurmdbd": 1, "slurmctld": 2, "one": 3, "two": 4}
 
 
@@ -111,10 +111,10 @@ class Cluster:
         process = self._processes.pop(name)
         process.kill() if at_once else process.terminate()
         try:
-            process.wait(PATIENCE_S)
+            process.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait(PATIENCE_S)
+            process.wait(TIMEOUT_S)
 
     def stop(self) -> None:
         """Cancel all jobs and end what was started, the last daemon first; the control groups are removed."""
@@ -140,7 +140,7 @@ class Cluster:
         Raises:
             Problem: if it fails.
         """
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
         if check and done.returncode:
             raise Problem(f"{' '.join(command)} failed: {done.stderr.strip()}")
         return done.stdout.strip()
@@ -159,7 +159,7 @@ class Cluster:
 
     @staticmethod
     def _await(what: str, holds: Callable[[], bool]) -> None:
-        until_s = time.monotonic() + PATIENCE_S
+        until_s = time.monotonic() + TIMEOUT_S
         while not holds():
             if time.monotonic() > until_s:
                 raise Problem(f"Waited for {what} in vain.")

@@ -44,8 +44,8 @@ def _running(night: Night, batch: Batch, times: int = 1) -> str:
 def _must_fail(night: Night, batch: Batch, reason: str) -> None:
     batch.end(1)
     capture = batch.capture()
-    told = f"{capture['state']} in {capture['stage']}: {capture['reason']} {capture['hint']}"
-    night.say(f"exit code 1; {told}")
+    summary = f"{capture['state']} in {capture['stage']}: {capture['reason']} {capture['hint']}"
+    night.say(f"exit code 1; {summary}")
     if capture["state"] != "failed" or reason not in capture["reason"]:
         raise Problem(f"It has to fail with “{reason}”.\n{batch.output()}")
 
@@ -55,8 +55,8 @@ def _must_succeed(night: Night, batch: Batch, *, earlier: str = "", tries: int =
     batch.end(0)
     capture = batch.capture()
     notices = batch.notices.read_text(encoding="utf-8").split("\n")[:-1]
-    told = ", ".join(f"{name} {capture[name]}" for name in ("state", "tries", "earlier"))
-    night.say(f"exit code 0; {told}, notices {notices}")
+    summary = ", ".join(f"{name} {capture[name]}" for name in ("state", "tries", "earlier"))
+    night.say(f"exit code 0; {summary}, notices {notices}")
     if notices != ["house done", f"{batch.out.name} done"] or capture["tries"] != tries:
         raise Problem(f"There have to be {tries} attempts and two notices.\n{batch.output()}")
     if earlier not in " ".join(capture["earlier"]) or bool(earlier) != bool(capture["earlier"]):

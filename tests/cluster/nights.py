@@ -34,10 +34,10 @@ PLUGINS = (
 )
 PRESET = ("--preset", "preview", "--set", "train.iterations=100")
 PHOTOS = 6
-BROKEN_BYTES = 9000  # of a photo that ends before its last pixel
-PATIENCE_S = 1500.0
-LOOK_S = 0.5
-MOST_OVERHEAD_S = 180.0  # a capture; what else passes between stages is the start of processes
+BROKEN_BYTES = 9000  # length of a damaged photo, which ends before its last pixel
+TIMEOUT_S = 1500.0
+POLL_S = 0.5
+MAX_OVERHEAD_S = 180.0  # a capture; what else passes between stages is the start of processes
 SUBMITTED = re.compile(r"has been submitted with SLURM jobid (\d+) \(log: \S*/\d+-(\w+)/\d+\.log\)")
 
 
@@ -72,7 +72,7 @@ class Batch:
         """What it has printed."""
         return self._log.read_text(encoding="utf-8", errors="replace")[-3000:]
 
-    def end(self, code: int, patience_s: float = PATIENCE_S) -> None:
+    def end(self, code: int, patience_s: float = TIMEOUT_S) -> None:
         """Wait for its end with that exit code."""
         try:
             found = self.process.wait(patience_s)
@@ -83,7 +83,7 @@ class Batch:
         if found != code:
             raise Problem(f"It ended with {found}, not {code}.\n{self.output()}")
 
-    def wait_for(self, what: str, holds: Callable[[], object], patience_s: float = PATIENCE_S) -> Any:
+    def wait_for(self, what: str, holds: Callable[[], object], patience_s: float = TIMEOUT_S) -> Any:
         """Wait while it is running, and return what the function found."""
         until_s = time.monotonic() + patience_s
         while time.monotonic() < until_s:
@@ -92,7 +92,7 @@ class Batch:
                 return found
             if ended:
                 raise Problem(f"It ended before {what}.\n{self.output()}")
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         raise Problem(f"Waited for {what} in vain.\n{self.output()}")
 
     def begun(self, stage: str, times: int = 1) -> bool:
@@ -237,10 +237,10 @@ def compare_with_local(night: Night) -> None:
     for name in ("house", "barn"):
         gaps = overhead(batch.out / name / "events.jsonl")
         jobs, engine_s = night.between_jobs(batch, name)
-        told = f"{name}: {len(gaps)} stages in {jobs} jobs, {sum(gaps.values()):.0f} s between the stages"
-        night.say(f"{told}, of which {engine_s:.0f} s from a job's end to the next one's start")
-        if engine_s > MOST_OVERHEAD_S:
-            raise Problem(f"More than {MOST_OVERHEAD_S:.0f} s pass between the jobs of {name}.")
+        summary = f"{name}: {len(gaps)} stages in {jobs} jobs, {sum(gaps.values()):.0f} s between the stages"
+        night.say(f"{summary}, of which {engine_s:.0f} s from a job's end to the next one's start")
+        if engine_s > MAX_OVERHEAD_S:
+            raise Problem(f"More than {MAX_OVERHEAD_S:.0f} s pass between the jobs of {name}.")
 
 
 def digest(out: Path) -> str:

@@ -9,8 +9,8 @@ from frames import RenderCase, RenderOutcome
 PICTURES = {
     "colour": 5e-6,  # sums of some hundred rounded terms of size 1
     "alpha": 5e-6,
-    "depth_sum": 5e-5,  # the same, of depths up to ten
-    "depth_square_sum": 3e-4,  # of their squares
+    "depth_sum": 5e-5,  # sums of some hundred rounded depths up to ten
+    "depth_square_sum": 3e-4,  # sums of some hundred rounded squares of depths up to ten
     "median_depth": 5e-5,  # one depth
 }
 RADII = 2e-4

@@ -24,7 +24,7 @@ BETAS, EPSILON, COUNT = (0.9, 0.999), 1e-15, 7
 RATES = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": 2.5e-3}
 RATE_SH_REST = 2.5e-3 / 20
 SCALES = (-2.0, 0.5)  # to which log_scales are clamped
-KEY = (5, 600, 2)  # of the draws: seed, step, purpose
+KEY = (5, 600, 2)  # key of the random numbers: seed, step, purpose
 
 
 @dataclass(frozen=True)

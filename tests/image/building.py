@@ -19,9 +19,11 @@ SUITE = "bookworm"  # Debian 12, as in the base's name
 DOCKERFILE = Path("docker") / "Dockerfile"
 DRIVERS = ("overlay", "vfs")  # the second works everywhere, but copies all files for every layer
 TOOLS = ("buildah", "debootstrap", "runc")
-# Of Debian's packages, the slim images have neither documentation (but licences) nor translations; apt keeps no caches.
-UNWANTED = ("usr/share/doc", "usr/share/info", "usr/share/lintian", "usr/share/locale", "usr/share/man")
-DPKG_SLIM = "".join(f"path-exclude /{folder}/*\n" for folder in UNWANTED) + "path-include /usr/share/doc/*/copyright\n"
+# Folders that Debian's slim images leave out: documentation (but licences) and translations; apt keeps no caches.
+OMITTED_FOLDERS = ("usr/share/doc", "usr/share/info", "usr/share/lintian", "usr/share/locale", "usr/share/man")
+DPKG_SLIM = (
+    "".join(f"path-exclude /{folder}/*\n" for folder in OMITTED_FOLDERS) + "path-include /usr/share/doc/*/copyright\n"
+)
 APT_CLEAN = """\
 DPkg::Post-Invoke { "rm -f /var/cache/apt/archives/*.deb /var/cache/apt/*.bin || true"; };
 Dir::Cache::pkgcache "";
@@ -165,8 +167,8 @@ def _make_slim(folder: Path) -> None:
     """Leave out of a base, and of packages installed on it later, what Debian's slim images leave out."""
     (folder / "etc" / "dpkg" / "dpkg.cfg.d" / "slim").write_text(DPKG_SLIM, encoding="utf-8")
     (folder / "etc" / "apt" / "apt.conf.d" / "clean").write_text(APT_CLEAN, encoding="utf-8")
-    for unwanted in UNWANTED:
-        for path in (folder / unwanted).rglob("*"):
+    for omitted in OMITTED_FOLDERS:
+        for path in (folder / omitted).rglob("*"):
             if not path.is_dir() and path.name != "copyright":
                 path.unlink()
     for cache in (folder / "var" / "cache" / "apt").glob("*.bin"):

@@ -17,10 +17,10 @@ from building import Image, Problem
 USER = 54321  # in no passwd file of the image
 SHM = "size=65536k"  # Docker's default
 DOCKER_KILLS_S = 10.0
-PATIENCE_S = 3600.0  # for a busy machine; a hanging container fails the test
-LOOK_S = 0.1
+TIMEOUT_S = 3600.0  # for a busy machine; a hanging container fails the test
+POLL_S = 0.1
 MEMORY = 4 << 30  # memory limit of its control group, bytes
-PERIOD_US = 100_000  # of the control group that limits processors
+PERIOD_US = 100_000  # period of the control group that limits processors
 DEVICES = ["nosuid", "noexec"]
 
 
@@ -76,7 +76,7 @@ class Container:
         """
         started_s = time.monotonic()
         with self._running(command, cores) as process:
-            process.wait(PATIENCE_S)
+            process.wait(TIMEOUT_S)
         say(f"splatpipe {' '.join(command)}: exit code {process.returncode}, {time.monotonic() - started_s:.0f} s.")
         if process.returncode != code:
             raise Problem(f"It has to be {code}.\n{self._output()}")
@@ -95,11 +95,11 @@ class Container:
                 process.wait(DOCKER_KILLS_S)
             except subprocess.TimeoutExpired:
                 subprocess.run(["runc", "kill", self._name, "KILL"], check=True)
-                process.wait(PATIENCE_S)
+                process.wait(TIMEOUT_S)
             return ContainerEnd(process.returncode, time.monotonic() - sent_s, progress, self._output())
 
     def _await_progress(self, process: subprocess.Popen[bytes], before: int, stage: str, done: float) -> str:
-        until_s = time.monotonic() + PATIENCE_S
+        until_s = time.monotonic() + TIMEOUT_S
         while time.monotonic() < until_s:
             for event in list(self._events())[before:]:
                 data = event["data"]
@@ -107,7 +107,7 @@ class Container:
                     return f"{data['what']} {data['done']:.0f} of {data['total']:.0f}"
             if process.poll() is not None:
                 raise Problem(f"It ended before it could be stopped inside {stage}.\n{self._output()}")
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         raise Problem(f"It never came to {stage}.\n{self._output()}")
 
     def _events(self) -> Iterator[dict]:
@@ -133,7 +133,7 @@ class Container:
         finally:
             if process.poll() is None:
                 subprocess.run(["runc", "delete", "--force", self._name], check=False)
-                process.wait(PATIENCE_S)
+                process.wait(TIMEOUT_S)
 
     def _config(self, command: list[str], cores: int) -> dict:
         """Return the configuration of ``docker run --read-only --network none --user 54321:54321 --memory 4g -v …``."""

@@ -27,7 +27,7 @@ PROGRAMS = {"docker": "docker.io", "dockerd": "docker.io", "debootstrap": "deboo
 TAG = "splatpipe:cpu"
 PHOTOS = 6
 USER = "54321:54321"
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 SHORT = ("--preset", "preview", "--set", "train.iterations=100")
 
 
@@ -67,7 +67,7 @@ def daemon() -> Iterator[None]:
         process = subprocess.Popen([*map(str, command)], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
     os.environ["DOCKER_HOST"] = f"unix://{socket}"
     try:
-        until_s = time.monotonic() + PATIENCE_S
+        until_s = time.monotonic() + TIMEOUT_S
         while docker("version", "--format", "{{.Server.Version}}").returncode:
             if process.poll() is not None or time.monotonic() > until_s:
                 raise Problem(f"dockerd does not start; its output is in {WORK / 'dockerd.txt'}.")
@@ -78,7 +78,7 @@ def daemon() -> Iterator[None]:
         for container in docker("ps", "-q").stdout.split():
             docker("kill", container)
         process.terminate()
-        process.wait(PATIENCE_S)
+        process.wait(TIMEOUT_S)
 
 
 def docker(*arguments: object, buildkit: bool = True) -> subprocess.CompletedProcess[str]:
@@ -127,10 +127,10 @@ def build(torch_index: str) -> None:
     small = WORK / "secret"
     small.mkdir(exist_ok=True)
     (small / "Dockerfile").write_text(f"FROM {base}\nRUN --mount=type=secret,id=pip true\n", encoding="utf-8")
-    told = docker("build", small, buildkit=False)
-    if told.returncode == 0 or "BuildKit" not in told.stderr:
-        raise Problem(f"Without BuildKit it has to be refused: {told.stderr[-500:]}")
-    say(f"Without BuildKit: {told.stderr.strip().splitlines()[-1]}")
+    refusal = docker("build", small, buildkit=False)
+    if refusal.returncode == 0 or "BuildKit" not in refusal.stderr:
+        raise Problem(f"Without BuildKit it has to be refused: {refusal.stderr[-500:]}")
+    say(f"Without BuildKit: {refusal.stderr.strip().splitlines()[-1]}")
     began_s = time.monotonic()
     with served_folders() as address_of:
         arguments = ["--network", "host", *index_secrets(WORK, address_of), "--build-arg", f"TORCH_INDEX={torch_index}"]
@@ -188,15 +188,15 @@ def check_memory() -> None:
         began_s = time.monotonic()
         out = new_out(limit)
         done = contained([*places, "-v", f"{out}:/out", "--memory", limit], "run", "/photos", "/out", *SHORT)
-        told = " ".join(done.stderr.replace("│", " ").split())
-        say(f"--memory {limit}: exit code {done.returncode} after {time.monotonic() - began_s:.0f} s. {told[-330:]}")
-        if done.returncode != 4 or "Training does not fit" not in told or (out / "stages").exists():
+        errors = " ".join(done.stderr.replace("│", " ").split())
+        say(f"--memory {limit}: exit code {done.returncode} after {time.monotonic() - began_s:.0f} s. {errors[-330:]}")
+        if done.returncode != 4 or "Training does not fit" not in errors or (out / "stages").exists():
             raise Problem("It has to be refused at once, with 4.")
     for limit, code, killed in (("110m", 3, "the stage's process"), ("40m", 137, "process 1")):
         sizes = [*places, "-v", f"{new_out(limit)}:/out", "--memory", limit, "--memory-swap", limit]
         done = contained(sizes, "run", "/photos", "/out", *SHORT, "--until", "ingest")
-        told = " ".join(done.stderr.replace("│", " ").split())
-        say(f"--memory {limit} kills {killed}: exit code {done.returncode}. {told[-250:]}")
+        errors = " ".join(done.stderr.replace("│", " ").split())
+        say(f"--memory {limit} kills {killed}: exit code {done.returncode}. {errors[-250:]}")
         if done.returncode != code:
             raise Problem(f"It has to be {code}.")
 

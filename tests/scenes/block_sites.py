@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.state.state import TrainState
 
-WINDOW = 1000  # of 72 × 54 pixels: four windows a photo, and one at half the size
+WINDOW = 1000  # pixels of a window: four windows in a photo of 72 × 54, and one at half the size
 
 CELLS = (Cell((-3.0, -1.5), (0.0, 3.0)), Cell((0.0, -1.5), (3.0, 3.0)))
 
@@ -62,15 +62,15 @@ class Kill(BaseException):
     """Stands in for a kill."""
 
 
-def step_with(patch: pytest.MonkeyPatch, look: Callable[[TrainState, TrainingPhoto], None]) -> None:
-    """Call ``look`` before each iteration."""
+def step_with(patch: pytest.MonkeyPatch, observe: Callable[[TrainState, TrainingPhoto], None]) -> None:
+    """Call ``observe`` before each iteration."""
     step = loop.iterate
 
-    def looking(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
-        look(state, photo)
+    def observed_iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
+        observe(state, photo)
         step(state, plan, photo)
 
-    patch.setattr(loop, "iterate", looking)
+    patch.setattr(loop, "iterate", observed_iterate)
 
 
 def coverages_of(site: SiteParts) -> list[PhotoCoverage]:

@@ -19,10 +19,10 @@ from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.cells.visibility import Windows
 
-LENGTH, WIDTH = 48.0, 24.0  # of the ground, metres, its corner at the origin, up is +z
-SPACING = 0.25  # of the Gaussians
+LENGTH, WIDTH = 48.0, 24.0  # ground, in metres, with its corner at the origin, up is +z
+SPACING = 0.25  # between Gaussians, metres
 BUILDINGS = ((6.0, 6.0, 14.0, 16.0, 6.0), (30.0, 8.0, 42.0, 14.0, 4.0))  # two corners in plan, and a height
-HEIGHT = 20.0  # of the flight
+HEIGHT = 20.0  # flying height, metres
 PHOTO = (160, 120)
 FOCAL = 130.0
 OPTIONS = RenderOptions(sh_degree=0, near=0.1)
@@ -86,8 +86,8 @@ def observed(
     for view in cameras:
         rows, pixels, depths = view.in_view(xyz)
         columns, lines = pixels.astype(int).T
-        shown = render_depth(coarse, view, OPTIONS)[lines, columns]
-        found.append(rows[depths < shown + 0.5])
+        rendered_depth = render_depth(coarse, view, OPTIONS)[lines, columns]
+        found.append(rows[depths < rendered_depth + 0.5])
     return found
 
 

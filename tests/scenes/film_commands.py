@@ -6,7 +6,7 @@ from pathlib import Path
 
 from command import splatpipe
 
-SECONDS = 2.0  # of the shared run's film
+SECONDS = 2.0  # length of the shared run's film
 
 
 def render(out: Path, *arguments: object) -> subprocess.CompletedProcess[str]:

@@ -74,11 +74,11 @@ def flown(
     lens = camera()
     photo, point, pixels = [], [], []
     for k, (rotation, centre) in enumerate(zip(turn, place, strict=True)):
-        shown = np.asarray(lens.img_from_cam((ground - centre) @ rotation.T))
-        inside = np.flatnonzero(((shown > 0.0) & (shown < [WIDTH, HEIGHT])).all(axis=1))
+        projected = np.asarray(lens.img_from_cam((ground - centre) @ rotation.T))
+        inside = np.flatnonzero(((projected > 0.0) & (projected < [WIDTH, HEIGHT])).all(axis=1))
         photo.append(np.full(len(inside), k))
         point.append(inside)
-        pixels.append(shown[inside] + noise_px * rng.normal(size=(len(inside), 2)))
+        pixels.append(projected[inside] + noise_px * rng.normal(size=(len(inside), 2)))
     order = np.lexsort((np.concatenate(photo), np.concatenate(point)))
     views = np.bincount(np.concatenate(point), minlength=len(ground))
     kept = (views >= 2)[np.concatenate(point)[order]]

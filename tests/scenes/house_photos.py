@@ -16,7 +16,7 @@ from splatpipe.pipeline.surface.depths.sources import DepthSource
 from splatpipe.pipeline.survey.crs.frames import Frame
 
 GSD_M = 0.1
-SIDE_M = 10.0  # of the area made into clouds and meshes: the house, and lawn around it
+SIDE_M = 10.0  # side of the area made into clouds and meshes: the house, and lawn around it
 
 
 def house_site() -> SiteExtent:

@@ -85,14 +85,14 @@ def make_scene(
     keypoints = {}
     for number, (pose, lens) in enumerate(zip(poses, lens_of, strict=True), start=1):
         in_camera = places @ pose[:, :3].T + pose[:, 3]
-        shown = np.asarray(lens.img_from_cam(in_camera))
-        inside = (in_camera[:, 2] > 0.1) & (shown > 0.0).all(axis=1) & (shown < [WIDTH, HEIGHT]).all(axis=1)
+        projected = np.asarray(lens.img_from_cam(in_camera))
+        inside = (in_camera[:, 2] > 0.1) & (projected > 0.0).all(axis=1) & (projected < [WIDTH, HEIGHT]).all(axis=1)
         keypoints[number] = np.zeros((0, 2), np.float32)
         rows = []
         for index in np.flatnonzero(inside).tolist():
             if rng.uniform() < TRACK / len(poses):
                 seen[index].append((number, len(rows)))
-                rows.append(shown[index] + rng.normal(0.0, noise_px, 2))
+                rows.append(projected[index] + rng.normal(0.0, noise_px, 2))
         keypoints[number] = np.array(rows, np.float32).reshape(-1, 2)
         image = pycolmap.Image(f"{number:03}.jpg", keypoints[number].astype(np.float64), lens.camera_id, number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))

@@ -39,12 +39,14 @@ def make_sides(alike: float, count: int = 24, reach: int = 3, points: int = 1600
         centre = np.array([20.0 * np.cos(angle), 20.0 * np.sin(angle), 2.0 + 2.0 * (number % 3)])
         pose = look_from(centre, rng.normal(0.0, 0.5, 3), 0.0)
         in_camera = places @ pose[:, :3].T + pose[:, 3]
-        shown = np.asarray(lens.img_from_cam(in_camera))
-        inside = (shown > 0.0).all(axis=1) & (shown < [WIDTH, HEIGHT]).all(axis=1)
+        projected = np.asarray(lens.img_from_cam(in_camera))
+        inside = (projected > 0.0).all(axis=1) & (projected < [WIDTH, HEIGHT]).all(axis=1)
         seen = (np.arange(2 * points) < points) == (number <= count // 2)
         rows[number] = np.flatnonzero(inside & seen & (abs(np.cos(angle)) > FACING))
         poses[number] = pose
-        keypoints[number] = (shown[rows[number]] + rng.normal(0.0, NOISE_PX, (len(rows[number]), 2))).astype(np.float32)
+        keypoints[number] = (projected[rows[number]] + rng.normal(0.0, NOISE_PX, (len(rows[number]), 2))).astype(
+            np.float32
+        )
     matches = {}
     for i in range(1, count + 1):
         for j in range(i + 1, count + 1):
@@ -52,12 +54,12 @@ def make_sides(alike: float, count: int = 24, reach: int = 3, points: int = 1600
             there = j if same else j - count // 2
             if abs(there - i) > reach:
                 continue
-            looks = [rows[i] % points if not same else rows[i], rows[j] % points if not same else rows[j]]
-            kept = [look[look < doubles] if not same else look for look in looks]
+            patterns = [rows[i] % points if not same else rows[i], rows[j] % points if not same else rows[j]]
+            kept = [pattern[pattern < doubles] if not same else pattern for pattern in patterns]
             shared = np.intersect1d(*kept)
             shared = np.sort(shared[rng.permutation(len(shared))[:most]])
             if len(shared) >= 15:
-                columns = [np.searchsorted(look, shared) for look in looks]
+                columns = [np.searchsorted(pattern, shared) for pattern in patterns]
                 matches[i, j] = np.column_stack(columns).astype(np.uint32)
     names = {number: f"{number:03}.jpg" for number in poses}
     verified = ViewGraph(names, dict.fromkeys(poses, 1), {1: lens}, keypoints, dict(sorted(matches.items())))
@@ -74,12 +76,12 @@ def folded(ring: Ring, alike: float) -> pycolmap.Reconstruction:
     seen: dict[int, list[tuple[int, int]]] = {}
     for number, rows in ring.rows.items():
         for keypoint, row in enumerate(rows.tolist()):
-            look = row % points if row % points < doubles else row
-            seen.setdefault(look, []).append((number, keypoint))
-    for look, track in sorted(seen.items()):
+            pattern = row % points if row % points < doubles else row
+            seen.setdefault(pattern, []).append((number, keypoint))
+    for pattern, track in sorted(seen.items()):
         if len(track) >= 2:
             elements = [pycolmap.TrackElement(*element) for element in track]
-            model.add_point3D(back[look], pycolmap.Track(elements), np.zeros(3, np.uint8))
+            model.add_point3D(back[pattern], pycolmap.Track(elements), np.zeros(3, np.uint8))
     return model
 
 

@@ -21,7 +21,7 @@ QUICK = (
     "ortho.gsd_m=0.3",
 )
 STAGES = [stage.name for stage in LINE]
-SURFACES = ["dsm", "ortho"]  # of QUICK: what is turned off reads nothing, and is not made again
+SURFACES = ["dsm", "ortho"]  # surface stages that QUICK makes: what is turned off reads nothing, and is not made again
 
 
 def sets(*assignments: str) -> list[str]:

@@ -73,8 +73,8 @@ def trace(
     return SkyPhoto(camera, pixels), np.isinf(nearest)
 
 
-def _paint(colour, nearest, distance, rays, origin, look):  # type: ignore[no-untyped-def]
-    base, contrast = look
+def _paint(colour, nearest, distance, rays, origin, appearance):  # type: ignore[no-untyped-def]
+    base, contrast = appearance
     seen = distance < nearest
     grain = np.random.default_rng(2).uniform(-1.0, 1.0, (HEIGHT // 4, WIDTH // 4)).astype(np.float32)
     grain = cv2.resize(grain, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
@@ -105,7 +105,8 @@ HEADINGS = (-24.0, -15.0, -6.0, 4.0, 13.0, 22.0)
 def write_dataset(folder: Path, pitch_deg: float = 5.0) -> Path:
     """Write a dataset of photos of the blocks, in `undistort`'s format; every camera sees the ground's points."""
     cameras = [
-        replace(look(heading, pitch_deg, x=0.1 * heading), name=f"{i}.png") for i, heading in enumerate(HEADINGS)
+        replace(aimed_camera(heading, pitch_deg, x=0.1 * heading), name=f"{i}.png")
+        for i, heading in enumerate(HEADINGS)
     ]
     for camera in cameras:
         path = folder / "images" / camera.name

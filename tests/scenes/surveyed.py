@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 TRUTH: dict[str, Any] = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
 PLACE = Origin(**TRUTH["frame"]["origin"])
 WIDTH, HEIGHT = TRUTH["camera"]["width"], TRUTH["camera"]["height"]
-LENS = tuple(TRUTH["camera"]["params"])  # of SIMPLE_RADIAL: f, cx, cy, k
+LENS = tuple(TRUTH["camera"]["params"])  # SIMPLE_RADIAL's parameters: f, cx, cy in pixels, k
 POINTS = {point["name"]: point for point in TRUTH["points"]}
 MODEL_FROM_WORLD = Similarity(0.137, rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([0.3, -0.2, 1.4]))
 NADIR = tuple(f"DJI_00{number}.JPG" for number in range(32, 41))
@@ -82,11 +82,11 @@ def true_model(
         facing = ((np.array(truth["centre_m"]) - places) * normals).sum(axis=1) > 0.0
         pixels = np.asarray(camera.img_from_cam(seen))
         inside = (pixels > 0.0).all(axis=1) & (pixels < [WIDTH, HEIGHT]).all(axis=1) & (seen[:, 2] > 1.0)
-        shown = np.flatnonzero(facing & inside)
-        noisy = pixels[shown] + rng.normal(size=(len(shown), 2)) * FEATURE_PX
+        visible = np.flatnonzero(facing & inside)
+        noisy = pixels[visible] + rng.normal(size=(len(visible), 2)) * FEATURE_PX
         image = pycolmap.Image(truth["name"], noisy, 1, number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-        for k, point in enumerate(shown.tolist()):
+        for k, point in enumerate(visible.tolist()):
             tracks[point].append(pycolmap.TrackElement(number, k))
     for place, track in zip(places, tracks, strict=True):
         if len(track) >= 2:

@@ -58,10 +58,10 @@ def make_ring(
         if one_spot:
             pose = look_from(np.zeros(3), centre * [1.0, 1.0, 0.1], 0.0)
         in_camera = places @ pose[:, :3].T + pose[:, 3]
-        shown = np.asarray(lens.img_from_cam(in_camera))
-        inside = (shown > 0.0).all(axis=1) & (shown < [WIDTH, HEIGHT]).all(axis=1)
+        projected = np.asarray(lens.img_from_cam(in_camera))
+        inside = (projected > 0.0).all(axis=1) & (projected < [WIDTH, HEIGHT]).all(axis=1)
         poses[number], rows[number] = pose, np.flatnonzero(inside)
-        keypoints[number] = (shown[inside] + rng.normal(0.0, NOISE_PX, (inside.sum(), 2))).astype(np.float32)
+        keypoints[number] = (projected[inside] + rng.normal(0.0, NOISE_PX, (inside.sum(), 2))).astype(np.float32)
     matches = {}
     for i in range(1, count + 1):
         for step in range(1, reach + 1):
@@ -141,14 +141,14 @@ def with_shifted_matches(ring: Ring, count: int, shift: float = 1.5) -> ViewGrap
     far = [(i, j) for i in ring.poses for j in ring.poses if i < j and (i, j) not in matches]
     for i, j in [far[row] for row in np.sort(rng.permutation(len(far))[:count])]:
         places = ring.points[rng.permutation(len(ring.points))[:30]]
-        shown = []
+        projections = []
         for number, offset in ((i, 0.0), (j, shift)):
             pose = ring.poses[number]
             seen = np.asarray(lens.img_from_cam((places + np.array([0.0, offset, 0.0])) @ pose[:, :3].T + pose[:, 3]))
-            shown.append(seen + rng.normal(0.0, NOISE_PX, seen.shape))
-        inside = np.all([((it > 0.0) & (it < [WIDTH, HEIGHT])).all(axis=1) for it in shown], axis=0)
+            projections.append(seen + rng.normal(0.0, NOISE_PX, seen.shape))
+        inside = np.all([((it > 0.0) & (it < [WIDTH, HEIGHT])).all(axis=1) for it in projections], axis=0)
         columns = []
-        for number, seen in zip((i, j), shown, strict=True):
+        for number, seen in zip((i, j), projections, strict=True):
             columns.append(len(keypoints[number]) + np.arange(inside.sum()))
             keypoints[number] = np.concatenate([keypoints[number], seen[inside].astype(np.float32)])
         matches[i, j] = np.column_stack(columns).astype(np.uint32)

@@ -42,7 +42,7 @@ from splatpipe.stages.line import LINE
 POLL_S = 1.0
 STOPPED_NOTICE_S = 1.5  # after a signal: the jobs may have taken eight seconds to end, and Docker kills after ten
 CHANGE_INTERVAL_S = 5.0  # between progress updates; a capture's change of state is reported at once
-LOCK_PATIENCE_S = 15.0  # a killed call's guard ends its jobs within this time
+LOCK_TIMEOUT_S = 15.0  # a killed call's guard ends its jobs within this time
 NAMES_FILE = "captures.json"  # below BATCH_FOLDER: every capture that was ever listed
 ENDS = {"done": "done", "failed": "failed", "stopped": "stopped"}
 
@@ -73,7 +73,7 @@ def lock_folder(out: Path) -> Iterator[int]:
     check_folder(out)
     _own_folder(out)
     with ExitStack() as stack:
-        deadline = time.monotonic() + LOCK_PATIENCE_S
+        deadline = time.monotonic() + LOCK_TIMEOUT_S
         while True:
             try:
                 held = stack.enter_context(locked(out, folder=BATCH_FOLDER))

@@ -27,7 +27,7 @@ from splatpipe.pipeline.engine.stage import stage_name
 
 VIEWER_FILE = "viewer.html"
 STOPPED = "It was stopped with the batch."
-# Of parallel shards' states, the first of these counts.
+# States of parallel shards, by precedence: the stage has the first that any of its shards has.
 STATE_PRIORITY = ("running", "waiting", "failed", "stopped", "done", "reused")
 RESUME_HINT = "Repeat the command to resume: finished work is reused."
 

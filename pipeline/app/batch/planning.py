@@ -42,9 +42,9 @@ from splatpipe.pipeline.engine.stage import Shard, stage_name
 from splatpipe.stages.forecast import forecast, machine_speed
 from splatpipe.stages.line import LINE
 
-CLUSTER_THREADS = 8  # of a job on another machine at most; a profile's set-threads overrides it
+CLUSTER_THREADS = 8  # most threads of a job on another machine; a profile's set-threads overrides it
 LIGHT_S = 300.0  # a shorter stage shares its job with its neighbours: an engine's queue costs some 30 s a job
-LONGEST_SLUG = 40
+MAX_SLUG_LETTERS = 40
 NOT_RETRIED = "Nothing has changed since, so it was not retried; use --retry-failed to do so."
 
 
@@ -131,7 +131,7 @@ def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings)
 
 
 def _slug(name: str) -> str:
-    return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-")[:LONGEST_SLUG]
+    return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-")[:MAX_SLUG_LETTERS]
 
 
 def _draft_capture(capture: ListedCapture, key: str, call: Call, settings: Settings) -> _CaptureDraft:
@@ -170,8 +170,8 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
     memory = available_memory_bytes() if settings.local else 0
     forecast_needs = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
     # If the stage that counts the shards has to run, it will determine their number.
-    counted = [each for each in statuses if each.stage.name in names] if first else []
-    shards = {} if planned.message else missing_shards(counted)
+    first_stages = [each for each in statuses if each.stage.name in names] if first else []
+    shards = {} if planned.message else missing_shards(first_stages)
     return _CaptureDraft(planned, tuple(needed), () if planned.message else names, forecast_needs, shards)
 
 
@@ -219,7 +219,7 @@ def _with_previous_failure(planned: PlannedCapture, first: StageStatus, out: Pat
             history = read_history(path, running=is_locked(out))
             culprit = history.culprit
             same_version = history.versions.get("splatpipe") == importlib.metadata.version("splatpipe")
-            if culprit is None or culprit.state != "failed" or not culprit.lasting or not same_version:
+            if culprit is None or culprit.state != "failed" or not culprit.permanent or not same_version:
                 continue
             if (culprit.name, culprit.key) == (status.stage.name, status.key):
                 hint = f"{culprit.hint} {NOT_RETRIED}".strip()

@@ -443,9 +443,9 @@ def main() -> NoReturn:
     except Exception as error:
         from splatpipe.pipeline.app.commands.console import show_error
 
-        shown = for_the_user(error)
-        show_error(shown)
-        sys.exit(exit_code(shown))
+        user_error = for_the_user(error)
+        show_error(user_error)
+        sys.exit(exit_code(user_error))
     sys.exit(0)
 
 

@@ -34,8 +34,8 @@ from splatpipe.pipeline.engine.stage import JSON, stage_name
 
 PLAIN_INTERVAL_S = 10.0  # between progress lines in a log file
 PLAIN_WIDTH = 120  # columns of a table in a log file
-MIN_OFFSET_M = 0.01  # of a flight's positions; smaller offsets are not shown
-POINTS_SHOWN = 40  # more are only in metrics.json
+MIN_OFFSET_M = 0.01  # smallest offset of a flight's positions that is shown
+MAX_POINTS = 40  # more are only in metrics.json
 GROUPS = {"gps": "photo positions", "control": "control points", "check": "check points"}
 MARKS = {"good": ("✓", "green"), "doubt": ("!", "yellow"), "bad": ("✗", "red")}
 COLOURS = {"valid": "green", "stale": "yellow", "missing": "red", "waiting": "dim"}
@@ -280,8 +280,8 @@ def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], result
     console.print(f"\n[bold]{done}[/]", soft_wrap=True)
     sizes: dict[Path, int] = {}
     for path in files:  # files in a folder are shown as the folder
-        shown = out / path.relative_to(out).parts[0]
-        sizes[shown] = sizes.get(shown, 0) + path.stat().st_size
+        entry = out / path.relative_to(out).parts[0]
+        sizes[entry] = sizes.get(entry, 0) + path.stat().st_size
     for path, size in sizes.items():
         console.print(f"  {escape(str(path))}  [dim]{_bytes(size)}[/]", soft_wrap=True)
     for line in result_lines:
@@ -324,17 +324,17 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
     console.print("\n[bold]Accuracy[/], root mean square in metres" + (f"; GSD {gsd:.4f} m" if gsd else ""))
-    shown = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # within 80 columns
+    accuracy_table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # within 80 columns
     for title in ("", "n", "east", "north", "up", "horiz.", "3D", "95 % horiz", "95 % up"):
-        shown.add_column(title, justify="right" if title else "left", no_wrap=True)
+        accuracy_table.add_column(title, justify="right" if title else "left", no_wrap=True)
     for title, table in groups:
         figures = [_metres(table.get(f"rmse_{name}_m")) for name in ("east", "north", "up", "horizontal", "3d")]
         bounds = [_bounds(table.get(f"interval_95_{name}_m")) for name in ("horizontal", "vertical")]
-        shown.add_row(title, str(table["count"]), *figures, *bounds)
-    console.print(shown)
+        accuracy_table.add_row(title, str(table["count"]), *figures, *bounds)
+    console.print(accuracy_table)
     for line in _offsets([flight for _, table in groups for flight in table.get("flights", [])]):
         console.print(line, soft_wrap=True)
-    if 0 < len(points) <= POINTS_SHOWN:
+    if 0 < len(points) <= MAX_POINTS:
         console.print(_points_table(points, {point["name"]: point for point in splat["points"]}))
         for point in points:
             if point.get("why"):

@@ -12,14 +12,14 @@ from splatpipe.pipeline.app.preflight.findings import Finding, PhotoFacts, Prefl
 from splatpipe.pipeline.app.report.facts.wording import number
 from splatpipe.pipeline.app.thumbnails import Thumbnail, crop_middle, thumbnail
 
-SIDE = 260  # pixels of a thumbnail's longer side
-CUT = (260, 195)  # photo pixels of a crop: blur of a pixel or two is invisible in a thumbnail
+THUMBNAIL_PX = 260  # pixels of a thumbnail's longer side
+CROP_PX = (260, 195)  # photo pixels of a crop: blur of a pixel or two is invisible in a thumbnail
 MAX_PER_FINDING = 8
 MAX_PICTURES = 40  # on the page: below a megabyte, and a second or two of decoding
-MAX_CROPS = 8  # of these crops, for which a photo is decoded completely
-CLOSE = ("blurred",)  # findings whose photos are shown as crops
-EXAMPLES = 3  # of photos that are dull throughout
-SHARP = 0.9  # least relative sharpness of a neighbour shown for comparison
+MAX_CROPS = 8  # crops on the page, each of which takes decoding a whole photo
+CROPPED_FINDINGS = ("blurred",)  # findings whose photos are shown as crops
+MAX_EXAMPLES = 3  # photos that are shown of a capture that is dull throughout
+MIN_SHARPNESS = 0.9  # least relative sharpness of a neighbour shown for comparison
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ def finding_pictures(preflight: Preflight) -> list[list[FindingPicture]]:
         pictures: list[FindingPicture] = []
         names = finding.photos or _examples(preflight, finding)
         for name in names[: min(MAX_PER_FINDING, left)]:
-            close = finding.code in CLOSE and cuts > 0
+            close = finding.code in CROPPED_FINDINGS and cuts > 0
             cuts -= close
             pictures.append(_make_picture(preflight.root, name, finding, photos.get(name), close=close))
-        if finding.code in CLOSE and pictures and cuts > 0:
+        if finding.code in CROPPED_FINDINGS and pictures and cuts > 0:
             other = _sharp_neighbour(preflight, names[0])
             if other is not None:
                 cuts -= 1
@@ -65,7 +65,7 @@ def facts_in_words(finding: Finding, photo: PhotoFacts | None) -> str:
     """The measurements of a photo that are relevant to a finding, in words."""
     if photo is None:
         return ""
-    if finding.code in CLOSE and photo.sharpness is not None:
+    if finding.code in CROPPED_FINDINGS and photo.sharpness is not None:
         return f"{photo.sharpness:.0%} as sharp as its neighbours".replace("%", " %")
     if any(word in finding.code for word in ("expos", "bright", "dark")):
         if photo.brightness_ev is not None:
@@ -81,9 +81,9 @@ def _examples(preflight: Preflight, finding: Finding) -> tuple[str, ...]:
     photos = preflight.photos
     if finding.code == "orphan":
         return tuple(photos[i].name for i in preflight.orphans)
-    if finding.code in CLOSE:
+    if finding.code in CROPPED_FINDINGS:
         known = [photo for photo in photos if photo.sharpness is not None]
-        return tuple(photo.name for photo in sorted(known, key=lambda photo: photo.sharpness or 0.0)[:EXAMPLES])
+        return tuple(photo.name for photo in sorted(known, key=lambda photo: photo.sharpness or 0.0)[:MAX_EXAMPLES])
     names = {photo.name for photo in photos}
     words = dict.fromkeys(word.strip("()") for word in re.split(r"[\s,;:]+", finding.message))
     return tuple(word for word in (each if each in names else each.rstrip(".") for each in words) if word in names)
@@ -96,7 +96,7 @@ def _make_picture(
     inside = ".." not in Path(name).parts and not Path(name).is_absolute()
     picture = None
     if inside:
-        picture = crop_middle(path, *CUT) if close else thumbnail(path, SIDE)
+        picture = crop_middle(path, *CROP_PX) if close else thumbnail(path, THUMBNAIL_PX)
     return FindingPicture(printable(name), picture, facts_in_words(finding, photo), beside)
 
 
@@ -109,5 +109,5 @@ def _sharp_neighbour(preflight: Preflight, name: str) -> PhotoFacts | None:
         for pair in preflight.pairs
         if own in (pair.first, pair.second)
     ]
-    sharp = [(n, i) for n, i in beside if (preflight.photos[i].sharpness or 0.0) >= SHARP]
+    sharp = [(n, i) for n, i in beside if (preflight.photos[i].sharpness or 0.0) >= MIN_SHARPNESS]
     return preflight.photos[max(sharp)[1]] if sharp else None

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
 
 DOWN_DEG = -75.0  # gimbal pitch: views less steep show walls, which determine the focal length
-ONE_HEIGHT = 0.1  # spread of the heights above take-off relative to their median
+MAX_RELATIVE_HEIGHT_SPREAD = 0.1  # spread of the heights above take-off relative to their median
 
 
 def predict_heights(
@@ -46,7 +46,7 @@ def predict_heights(
     try:
         with threadpool_limits(limits=1):  # BLAS sums in another order on several threads
             return predict_accuracy(intake.positions.positions, cameras, times)
-    except np.linalg.LinAlgError:  # of metadata that make no block
+    except np.linalg.LinAlgError:  # singular: the metadata make no block
         return None
 
 
@@ -78,7 +78,11 @@ def _nadir_only(intake: Intake) -> list[Finding]:
     if len(pitches) < max(3, len(intake.photos) // 2) or max(pitches) > DOWN_DEG:
         return []
     heights = [each.relative_altitude_m for each in stated if each.relative_altitude_m is not None]
-    if heights and np.median(heights) > 0.0 and np.ptp(heights) > ONE_HEIGHT * float(np.median(heights)):
+    if (
+        heights
+        and np.median(heights) > 0.0
+        and np.ptp(heights) > MAX_RELATIVE_HEIGHT_SPREAD * float(np.median(heights))
+    ):
         return []
     text = (
         "All photos look straight down from one height: the focal length, and with it heights, cannot be "

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from splatpipe.pipeline.app.preflight.findings import Place, Preflight
 
-WIDTH = 2000  # of the drawing, in its own units: integers are precise enough, and short
-NARROWEST, HIGHEST = 0.4, 1.0  # height over width
-MARGIN = 0.06  # of the longer side, around what is shown
-REACH = 0.3  # of the photos' extent: footprints of oblique views and points farther out are cut off
+WIDTH = 2000  # width of the drawing, in its own units: integers are precise enough, and short
+MIN_ASPECT, MAX_ASPECT = 0.4, 1.0  # height over width
+MARGIN_SHARE = 0.06  # border around the content, as a share of its longer side
+REACH_SHARE = 0.3  # farthest content in extents of the photos: oblique footprints and points beyond are cut off
 MIN_SPAN_M = 10.0  # a capture from one spot still has a map
-SCALE_SHARE = 0.25  # of the width, the most that the scale bar occupies
+SCALE_SHARE = 0.25  # largest share of the width that the scale bar occupies
 
 
 @dataclass(frozen=True)
@@ -67,21 +67,21 @@ def frame_of(preflight: Preflight) -> MapFrame | None:
     cameras = [photo.position_m[:2] for photo in preflight.photos if photo.position_m is not None]
     if not cameras:
         return None
-    reach = REACH * max(_span(cameras, 0), _span(cameras, 1), MIN_SPAN_M)
-    shown: list[Place] = [place for photo in preflight.photos for place in photo.footprint_m or ()]
-    shown += [place for gap in preflight.gaps for place in gap.outline_m]
+    reach = REACH_SHARE * max(_span(cameras, 0), _span(cameras, 1), MIN_SPAN_M)
+    content: list[Place] = [place for photo in preflight.photos for place in photo.footprint_m or ()]
+    content += [place for gap in preflight.gaps for place in gap.outline_m]
     low, high = ([bound(place[axis] for place in cameras) for axis in (0, 1)] for bound in (min, max))
     for point in (point.position_m for point in preflight.control):
         if all(low[axis] - reach <= point[axis] <= high[axis] + reach for axis in (0, 1)):
-            shown.append(point)
+            content.append(point)
     for axis in (0, 1):
-        near = [min(max(place[axis], low[axis] - reach), high[axis] + reach) for place in shown]
+        near = [min(max(place[axis], low[axis] - reach), high[axis] + reach) for place in content]
         low[axis], high[axis] = min([low[axis], *near]), max([high[axis], *near])
     east, north = (high[0] + low[0]) / 2, (high[1] + low[1]) / 2
-    margin = MARGIN * max(high[0] - low[0], high[1] - low[1], MIN_SPAN_M)
+    margin = MARGIN_SHARE * max(high[0] - low[0], high[1] - low[1], MIN_SPAN_M)
     wide, tall = high[0] - low[0] + 2 * margin, high[1] - low[1] + 2 * margin
-    tall = max(tall, NARROWEST * wide)
-    wide = max(wide, tall / HIGHEST)
+    tall = max(tall, MIN_ASPECT * wide)
+    wide = max(wide, tall / MAX_ASPECT)
     return MapFrame(east - wide / 2, north + tall / 2, wide, round(WIDTH * tall / wide))
 
 

@@ -28,10 +28,10 @@ from splatpipe.pipeline.survey.positions.swapped_positions import PositionEviden
 
 EXHAUSTIVE_UP_TO = 40  # photos: 780 pairs, five seconds
 NEIGHBOURS = 8  # partners per photo by position or sequence; a run uses 20
-LOOK_ALIKES = 4  # further partners by appearance, since positions may be wrong
-AGAIN = 16  # partners tried for photos without a match
-THIN_PARTNERS = 2.5  # least median number of matched photos: with fewer, a run loses photos
-WELL_CONNECTED = 0.9  # least share of the photos in the largest component; else the capture is fragmented
+SIMILAR_PARTNERS = 4  # further partners by appearance, since positions may be wrong
+RETRY_PARTNERS = 16  # partners tried for photos without a match
+MIN_MEDIAN_PARTNERS = 2.5  # least median number of matched photos: with fewer, a run loses photos
+MIN_CONNECTED_SHARE = 0.9  # least share of the photos in the largest component; else the capture is fragmented
 MIN_CONNECTED = 0.2  # least share for a reconstruction
 OUTLINE_SHARE = 0.35  # half the width of a gap's outline as a share of its length
 
@@ -76,11 +76,11 @@ def match_quickly(layout: Layout, all_features: Sequence[QuickFeatures], threads
     report.progress(0, 1, "matching quickly", "rounds")
     pairs = set(select_pairs(layout, pairing, NEIGHBOURS, alike))
     if pairing != "exhaustive":
-        pairs |= nearest(range(count), alike(), LOOK_ALIKES)
+        pairs |= nearest(range(count), alike(), SIMILAR_PARTNERS)
     found = match_quick_features(all_features, pairs, threads)
     unmatched = [k for piece in pieces_of(found, count)[1:] for k in piece]
     if unmatched and pairing != "exhaustive":
-        more = nearest(unmatched, alike(), AGAIN) - pairs
+        more = nearest(unmatched, alike(), RETRY_PARTNERS) - pairs
         found |= match_quick_features(all_features, more, threads)
     report.progress(1, 1, "matching quickly", "rounds")
     return MatchGraph(found, pieces_of(found, count))
@@ -120,7 +120,7 @@ def overlap_findings(names: Sequence[str], overlap: MatchGraph) -> list[Finding]
         hint = "Take photos between the groups, to connect them."
         findings.append(Finding("pieces", "warning", f"{text}.", hint))
     usual = float(np.median(overlap.partners(count)))
-    if usual < THIN_PARTNERS and count > 3:
+    if usual < MIN_MEDIAN_PARTNERS and count > 3:
         text = f"The overlap is low: a photo matches {usual:.0f} others (median)."
         findings.append(
             Finding("thin-overlap", "warning", text, "Fly with more overlap: two thirds along and across track.")

@@ -22,12 +22,12 @@ from splatpipe.pipeline.survey.files.control_file import titled
 MAX_PAIRS = 5_000  # lines; if there are more, those of weakly connected photos come first
 STRENGTHS = ((0, "weak"), (25, "fair"), (80, "strong"))  # least number of matches of each class
 CLEAR_PAIRS = 120  # lines drawn opaque; more of them are fainter, so that what is below shows through
-FAINTEST = 0.25
-MANY = 400  # photos, whose dots are smaller
+MIN_OPACITY = 0.25
+MANY_PHOTOS = 400  # photos, whose dots are smaller
 MAX_NAMED = 40  # control points with their names on the map
-RADIUS, MIDDLE = 880, 1000  # of the ring
+RADIUS, MIDDLE = 880, 1000  # radius and centre of the ring of photos, in the drawing's units
 LETTERS = {"wide": 34, "everywhere": 60}  # letter height in the drawing's units: as in the style sheet, and on a phone
-LONGEST_TITLE = 120  # characters of a name in a tooltip
+MAX_TITLE_LETTERS = 120  # characters of a name in a tooltip
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,10 @@ def overlap_map(preflight: Preflight, doubtful: Mapping[str, str]) -> OverlapMap
     }
     return OverlapMap(
         svg=_svg(
-            size, _summary(preflight, kind), len(places) > MANY, groups + (_scale(frame) if frame is not None else "")
+            size,
+            _summary(preflight, kind),
+            len(places) > MANY_PHOTOS,
+            groups + (_scale(frame) if frame is not None else ""),
         ),
         kind=kind,
         layers=tuple((name, titles[name]) for name, inner in drawn.items() if inner),
@@ -170,23 +173,23 @@ def _pairs(pairs: Sequence[MatchedPair], places: Mapping[int, tuple[int, int]], 
         else:
             paths[name] += f"M{x0} {y0}L{x1} {y1}"
     lines = "".join(_path(f"pair {name}", d) for name, d in paths.items())
-    clear = max(FAINTEST, min(1.0, math.sqrt(CLEAR_PAIRS / max(len(known), 1))))
+    clear = max(MIN_OPACITY, min(1.0, math.sqrt(CLEAR_PAIRS / max(len(known), 1))))
     return f'<g opacity="{clear:.2f}">{lines}</g>' if lines else ""
 
 
 def _strongest(pairs: Sequence[MatchedPair]) -> list[MatchedPair]:
     """The pairs to draw, weakest first; if there are too many, each photo's strongest have priority."""
-    ranked = sorted(pairs, key=lambda pair: (-pair.matches, pair.first, pair.second))
-    if len(ranked) > MAX_PAIRS:
+    strongest_first = sorted(pairs, key=lambda pair: (-pair.matches, pair.first, pair.second))
+    if len(strongest_first) > MAX_PAIRS:
         held: dict[int, int] = {}
         needed = []  # for each pair, the smaller number of lines so far of its two photos
-        for pair in ranked:
+        for pair in strongest_first:
             needed.append(min(held.get(pair.first, 0), held.get(pair.second, 0)))
             for photo in (pair.first, pair.second):
                 held[photo] = held.get(photo, 0) + 1
-        order = sorted(range(len(ranked)), key=lambda i: (needed[i], i))
-        ranked = [ranked[i] for i in order[:MAX_PAIRS]]
-    return sorted(ranked, key=lambda pair: (pair.matches, pair.first, pair.second))
+        order = sorted(range(len(strongest_first)), key=lambda i: (needed[i], i))
+        strongest_first = [strongest_first[i] for i in order[:MAX_PAIRS]]
+    return sorted(strongest_first, key=lambda pair: (pair.matches, pair.first, pair.second))
 
 
 def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtful: Mapping[str, str]) -> str:
@@ -196,7 +199,7 @@ def _photos(preflight: Preflight, places: Mapping[int, tuple[int, int]], doubtfu
     drawn: dict[str, list[str]] = {"plain": [], "doubtful": [], "apart": [], "orphan": []}
     for i, (x, y) in places.items():
         photo = preflight.photos[i]
-        title = printable(photo.name)[:LONGEST_TITLE]
+        title = printable(photo.name)[:MAX_TITLE_LETTERS]
         kind = "plain"
         if photo.name in doubtful:
             kind, title = "doubtful", f"{title}: {doubtful[photo.name]}"
@@ -217,7 +220,7 @@ def _control(frame: MapFrame, preflight: Preflight) -> str:
     for point in preflight.control:
         inside = frame.holds(point.position_m)
         x, y = frame.point(point.position_m) if inside else frame.at_edge(point.position_m)
-        name = printable(point.name)[:LONGEST_TITLE]
+        name = printable(point.name)[:MAX_TITLE_LETTERS]
         title = titled(point.kind, name)
         if not inside:
             off = math.dist(point.position_m, (frame.west + frame.metres / 2, frame.north - _tall(frame) / 2))

@@ -13,15 +13,16 @@ from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures
 from splatpipe.pipeline.sfm.recovery.refusal import texture_hint
 
-DULL = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
-DULL_SPREADS = 4.0  # times the usual deviation between photos, if a whole capture is blurred
-MANY = 0.08  # share of the photos above which it is reported once, for the whole capture
-MAD_TO_SIGMA = 1.4826  # of Gaussian noise
+MAX_LOG_ENERGY_RATIO = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
+MAX_LOG_ENERGY_SPREADS = 4.0  # times the usual deviation between photos, if a whole capture is blurred
+WHOLE_CAPTURE_SHARE = 0.08  # share of the photos above which it is reported once, for the whole capture
+MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation, for Gaussian noise
 JUMP_EV = 1.1  # relative to the neighbours; light and automatic exposure vary by 1.0 in good captures
 CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of clipped pixels, and its excess over most photos
 DARK_LEVEL, BRIGHT_LEVEL = 14.0, 244.0  # mean grey levels of a photo that shows nothing
-LITTLE_TEXTURE = 400  # median of the keypoints at 640 px; all captures tried have 740 or more, blurred small ones 250
-SAME_PICTURE = 1.0  # largest grey level difference between thumbnails of a photo saved twice
+# Median of the keypoints at 640 px; all captures tried have 740 or more, blurred small ones 250.
+MIN_MEDIAN_KEYPOINTS = 400
+MAX_DUPLICATE_DIFFERENCE = 1.0  # largest grey level difference between thumbnails of a photo saved twice
 
 
 def sharpness(detail_loss: Float64[np.ndarray, "n directions"]) -> Float64[np.ndarray, " n"]:
@@ -39,11 +40,11 @@ def find_blurred(photos: Sequence[CheckedPhoto], detail_loss: Float64[np.ndarray
         return []
     usual = float(np.median(known))
     spread = MAD_TO_SIGMA * float(np.median(np.abs(known - usual)))
-    limit = max(DULL, usual + DULL_SPREADS * spread)
+    limit = max(MAX_LOG_ENERGY_RATIO, usual + MAX_LOG_ENERGY_SPREADS * spread)
     dull = np.flatnonzero(np.nan_to_num(worst) > limit).tolist()
-    soft = np.flatnonzero(np.nan_to_num(worst) > DULL)
+    soft = np.flatnonzero(np.nan_to_num(worst) > MAX_LOG_ENERGY_RATIO)
     findings = []
-    if len(soft) > max(2.0, MANY * len(photos)) and len(soft) > len(dull):
+    if len(soft) > max(2.0, WHOLE_CAPTURE_SHARE * len(photos)) and len(soft) > len(dull):
         findings.append(
             Finding(
                 "blurred",
@@ -64,7 +65,7 @@ def find_blurred(photos: Sequence[CheckedPhoto], detail_loss: Float64[np.ndarray
 def find_little_texture(all_features: Sequence[QuickFeatures]) -> list[Finding]:
     """Find captures that show hardly anything to match, as thermal ones."""
     usual = float(np.median([len(features.places) for features in all_features]))
-    if usual >= LITTLE_TEXTURE:
+    if usual >= MIN_MEDIAN_KEYPOINTS:
         return []
     hint = texture_hint((features.width, features.height) for features in all_features)
     return [Finding("texture", "warning", "The photos have little texture: few of them will be placed.", hint)]
@@ -130,7 +131,7 @@ def find_copies(photos: Sequence[CheckedPhoto], all_features: Sequence[QuickFeat
         apart = np.sqrt(((small[:k] - small[k]) ** 2).mean(axis=1))
         j = int(apart.argmin())
         times = photos[j].exif.time, photos[k].exif.time
-        if apart[j] < SAME_PICTURE and (times[0] == times[1] or None in times):
+        if apart[j] < MAX_DUPLICATE_DIFFERENCE and (times[0] == times[1] or None in times):
             copies[photos[k].name] = photos[j].name
     if not copies:
         return []

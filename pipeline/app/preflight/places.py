@@ -21,7 +21,7 @@ from splatpipe.pipeline.survey.files.control_file import ControlFile, read_contr
 from splatpipe.pipeline.survey.files.scale_bars import read_scale_bars
 from splatpipe.pipeline.survey.points.surveyed_points import eaten_zeros, missing_photos
 
-OUTSIDE_SHARE = 0.3  # of the marks outside their photos: they were made in photos of another size, which ends a run
+OUTSIDE_SHARE = 0.3  # share of marks outside their photos above which these had another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
 REACH_SPACINGS, MIN_REACH_M = 3.0, 60.0  # around photos whose viewing direction is unknown
 
@@ -84,7 +84,7 @@ def control_findings(
             point.name,
             "check" if point.role == "check" else "control",
             (round(float(at[0]), 2), round(float(at[1]), 2)),
-            _shown_by(at, intake),
+            _count_showing_photos(at, intake),
             len({mark.photo for mark in point.marks}),
         )
         for point, at in zip(file.points, points, strict=True)
@@ -141,7 +141,7 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
     return findings
 
 
-def _shown_by(at: Float64[np.ndarray, " 2"], intake: Intake) -> int | None:
+def _count_showing_photos(at: Float64[np.ndarray, " 2"], intake: Intake) -> int | None:
     """The number of photos that may show a place on the ground; None if their poses are unknown."""
     views = intake.layout.views
     if views is None:

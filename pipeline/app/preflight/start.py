@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
 
 
-COMMAND_BYTES = 80_000_000  # of the command that waits for the stage's process; measured 66 MB
+COMMAND_BYTES = 80_000_000  # memory of the command that waits for the stage's process; measured 66 MB
 
 
 def require_readable(request: Request) -> None:

@@ -20,8 +20,8 @@ from splatpipe.pipeline.engine.heap import imports_outside_gc
 from splatpipe.pipeline.engine.python_module import python_module
 
 REPORT_FILE = "report.html"
-HEAD_BYTES = 4096  # of the page, with the digest of its results
-PATIENCE_S = 600.0  # far more than hundreds of photos take
+HEAD_BYTES = 4096  # beginning of the page, which contains the digest of its results
+TIMEOUT_S = 600.0  # far more than hundreds of photos take
 MIN_S = 2.0  # minimum time granted: enough for the report without images, even on a busy machine
 POLL_S = 0.02
 
@@ -86,7 +86,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     path = out / REPORT_FILE
     before = _stamp(path)
     began_s = time.monotonic()
-    end_s = began_s + PATIENCE_S if until_s is None else until_s
+    end_s = began_s + TIMEOUT_S if until_s is None else until_s
 
     def over() -> bool:
         now_s = time.monotonic()

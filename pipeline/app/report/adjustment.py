@@ -20,7 +20,7 @@ from splatpipe.pipeline.app.report.facts.wording import count, number, plural, t
 Chapter = dict[str, Any]
 CameraPlaces = Mapping[str, Sequence[float]]  # east, north, up by photo, metres
 NORMAL_95 = 1.96  # standard deviations that hold 95 % of normal errors
-STRONG = 0.9  # correlation above which two parameters are hardly told apart
+STRONG_CORRELATION = 0.9  # correlation above which two parameters are hardly told apart
 MAX_LENSES = 12
 MAX_FLIGHTS = 6  # with a chart
 MAX_NOISE = 12  # flights and states of the receiver
@@ -124,7 +124,7 @@ def _lens(name: str, lens: LensResult) -> Chapter:
         unit = " px" if each in IN_PIXELS else ""
         share = f" ({100.0 * sigma / value:.2g} %)" if each == "f" and value > 0.0 else ""
         row = lens.correlations[k] if lens.correlations else ()
-        partners = [f"{titles[j]} ({r:+.2f})" for j, r in enumerate(row) if j != k and abs(r) >= STRONG]
+        partners = [f"{titles[j]} ({r:+.2f})" for j, r in enumerate(row) if j != k and abs(r) >= STRONG_CORRELATION]
         rows.append(
             {
                 "title": titles[k],

@@ -96,7 +96,7 @@ def registration_chapter(inputs: ReportInputs, geometry: Geometry | None, *, dra
         "rungs": [_step_row(row) for row in sparse.get("ladder", [])],
         "adjusted_later": False,
     }
-    with suppress(OSError, ValueError):  # of another chapter, which reports it
+    with suppress(OSError, ValueError):  # unreadable: the chapter about it reports that
         chapter["adjusted_later"] = bool(adopted_focals_px(inputs, sparse.get("cameras", [])))
     if geometry is not None:
         chapter |= _registration_charts(inputs, geometry)

@@ -215,7 +215,7 @@ def _charts_and_marks(
         placed: Whether the model is georeferenced; otherwise there are no maps.
     """
     from splatpipe.pipeline.app.report.charts.charts import residual_map
-    from splatpipe.pipeline.app.report.charts.pictures import cut_chips
+    from splatpipe.pipeline.app.report.charts.pictures import cut_crops
 
     charts = []
     if placed:
@@ -226,22 +226,22 @@ def _charts_and_marks(
         if photos:
             text = "Residuals of the photos' own positions relative to the model."
             charts.append({"svg": residual_map(geometry, {"photo": photos}), "text": text})
-    chips = cut_chips(points, inputs.part("ingest.photos"), inputs.photos_dir)
+    crops = cut_crops(points, inputs.part("ingest.photos"), inputs.photos_dir)
     total = sum(len(point["observations"]) for point in points)
-    shown = [_marks(i, point, chips) for i, point in enumerate(points)]
-    marks = [mark for mark in shown if mark["chips"]]
-    return {"charts": charts, "marks": marks, "marks_left_out": total - len(chips)}
+    every_point = [_marks(i, point, crops) for i, point in enumerate(points)]
+    marks = [mark for mark in every_point if mark["chips"]]
+    return {"charts": charts, "marks": marks, "marks_left_out": total - len(crops)}
 
 
-def _marks(index: int, point: Mapping[str, Any], chips: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
+def _marks(index: int, point: Mapping[str, Any], crops: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
     """A point's crops, worst first."""
     entries = []
     for j, seen in enumerate(point["observations"]):
-        chip = chips.get((index, j))
-        if chip is not None:
+        image = crops.get((index, j))
+        if image is not None:
             residual = seen.get("residual_px")
             off = None if not residual else math.hypot(*residual)
-            crop = {"chip": chip, "photo": str(seen["photo"]), "off": number(off, 2), "used": seen.get("used", True)}
+            crop = {"chip": image, "photo": str(seen["photo"]), "off": number(off, 2), "used": seen.get("used", True)}
             entries.append((-(off or 0.0), j, crop))
     role = str(point["role"]).replace("_", " ")
     return {

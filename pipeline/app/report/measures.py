@@ -10,7 +10,7 @@ from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, outdated, rea
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.facts.wording import length
 
-MAX_ROWS = 200  # of volumes; the file has all of them
+MAX_ROWS = 200  # volumes in the table; the file has all of them
 BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated"}
 SIGMA_DIGITS = 2  # significant digits of a standard deviation
 

@@ -55,11 +55,11 @@ def processing_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
         versions = versions or dict(artifact.manifest.get("versions", {}))
         machine = machine or dict(artifact.manifest.get("machine", {}))
     options = {} if inputs.config is None else inputs.config.model_dump(mode="json")
-    counted = [row for row in rows if not _is_in_stage(inputs, row["name"])]
+    top_level_rows = [row for row in rows if not _is_in_stage(inputs, row["name"])]
     chapter: Chapter = {
         "rows": rows,
-        "total": duration(sum(row["seconds"] or 0.0 for row in counted)),
-        "cpu_total": duration(sum(row["cpu_seconds"] or 0.0 for row in counted)),
+        "total": duration(sum(row["seconds"] or 0.0 for row in top_level_rows)),
+        "cpu_total": duration(sum(row["cpu_seconds"] or 0.0 for row in top_level_rows)),
         "peak": size(max((row["memory"] or 0 for row in rows), default=0) or None),
         "forecast": _forecast([row["foreseen"] for row in rows if row["foreseen"]]),
         "machine": _machine(machine),

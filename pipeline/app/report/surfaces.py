@@ -13,7 +13,7 @@ PICTURE_SIDE = 960  # pixels
 FACADE_SIDE = 480
 MAX_FACADES = 12  # with an image; the list has all
 SECTION_SIDE = 720
-MAX_SECTIONS = 12  # likewise
+MAX_SECTIONS = 12  # with a drawing; the list has all
 QUALITY = 85
 
 Chapter = dict[str, Any]

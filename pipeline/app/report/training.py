@@ -17,7 +17,7 @@ MEASURES = {  # metrics of a held-out photo: title with the unit, digits
     "gmsd": ("GMSD", 3),
     "sharpness": ("sharpness", 3),
 }
-MAX_ROWS = 200  # of the table of held-out photos
+MAX_ROWS = 200  # held-out photos in the table
 
 
 def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
@@ -119,7 +119,7 @@ def _view_images(
     folder = inputs.part("evaluate.views")
     photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
     turned = {str(photo["name"]): int(photo.get("orientation") or 1) for photo in photos}
-    shown = []
+    entries = []
     for view in chosen_views(views):
         stem = str(view["file"])
         pictures = None
@@ -128,10 +128,10 @@ def _view_images(
         if pictures is not None:
             row = _row(view, measures)
             figures = list(zip((title for _, title, _ in measures), row["values"], strict=True))
-            shown.append({"name": str(view["name"]), "pictures": pictures, "figures": figures})
+            entries.append({"name": str(view["name"]), "pictures": pictures, "figures": figures})
     bars = [(str(view["name"]), float(view["psnr"])) for view in views if view.get("psnr") is not None]
     charts = [{"svg": view_bars(bars, "dB"), "text": "All judged photos, worst first."}] if len(bars) > 1 else []
-    return {"shown": shown, "charts": charts}
+    return {"shown": entries, "charts": charts}
 
 
 def _row(view: Mapping[str, Any], measures: Sequence[tuple[str, str, int]]) -> dict[str, Any]:
@@ -194,7 +194,7 @@ def _last(curve: Mapping[float, float]) -> float | None:
 
 
 def _why_earlier(summary: Mapping[str, Any]) -> str:
-    if parts := summary.get("flat"):  # of a training in blocks
+    if parts := summary.get("flat"):  # this key exists for a training in blocks
         blocks = len(parts.keys() - {"coarse"})
         where = ["in the coarse pass"] * ("coarse" in parts)
         where += [f"in {count(blocks)} of {count(summary.get('blocks'))} blocks"] * bool(blocks)

@@ -32,15 +32,16 @@ PLACED_GOOD, PLACED_DOUBT = 0.95, 0.75  # registered share of the photos
 ERROR_GOOD_PX, ERROR_DOUBT_PX = 1.0, 2.0  # mean reprojection error
 FOCAL_GOOD = 0.05  # relative deviation from the prior
 HORIZONTAL_GSDS, VERTICAL_GSDS = 2.0, 3.0  # RMSE at check points
-SURFACE_GSDS = 6.0  # of one surveyed point: twice the usual RMSE in height
+SURFACE_GSDS = 6.0  # largest error in height of one surveyed point, in GSDs: twice the usual RMSE
 MAX_NAMED = 3
-FEW_CHECKS = 3  # check points; fewer prove little
-PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # of held-out photos at 2 megapixels, exposure compensated (trials.md)
+MIN_CHECK_POINTS = 3  # check points; fewer prove little
+PSNR_GOOD_DB, PSNR_DOUBT_DB = 25.0, 20.0  # held-out photos at 2 megapixels, exposure compensated (trials.md)
 CAMERAS = "Cameras"
 CAMERAS_BAD = "The camera poses are unreliable"
 PLACE = "Place"
 PLACE_BAD = "The result contradicts what else is known of its place"
-VEIL = 0.03  # share of the light in front of held-out photos' points: 8 of 255 grey values, which begin to show
+# Share of the light in front of held-out photos' points: 8 of 255 grey values, which begin to show.
+MAX_VEIL_SHARE = 0.03
 
 
 @dataclass(frozen=True)
@@ -211,10 +212,10 @@ def _camera_reasons(inputs: ReportInputs) -> list[Mapping[str, Any]]:
     if not any(_is_focal_doubt(reason) for reason in reasons):
         return reasons
     try:
-        settled = _has_adopted_focals(inputs) and max(_focal_deviations(inputs), default=1.0) <= FOCAL_GOOD
+        focals_agree = _has_adopted_focals(inputs) and max(_focal_deviations(inputs), default=1.0) <= FOCAL_GOOD
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        settled = False
-    return [reason for reason in reasons if not (settled and _is_focal_doubt(reason))]
+        focals_agree = False
+    return [reason for reason in reasons if not (focals_agree and _is_focal_doubt(reason))]
 
 
 def _mapping_reasons(inputs: ReportInputs) -> list[Mapping[str, Any]]:
@@ -334,7 +335,7 @@ def _checked(table: Mapping[str, Any], gsd: float | None) -> VerdictLine:
         return VerdictLine("doubt", "Accuracy", f"{text}.")
     text += f", {number((horizontal or 0.0) / gsd, 1)} and {number((vertical or 0.0) / gsd, 1)} ground sample distances"
     good = (horizontal or 0.0) <= HORIZONTAL_GSDS * gsd and (vertical or 0.0) <= VERTICAL_GSDS * gsd
-    if table["count"] < FEW_CHECKS:
+    if table["count"] < MIN_CHECK_POINTS:
         return VerdictLine("doubt", "Accuracy", f"{text}; so few points prove little.")
     bounds = f"{HORIZONTAL_GSDS:g} and {VERTICAL_GSDS:g}"
     verdict = "as expected of a careful survey" if good else f"more than the {bounds} that are usual"
@@ -398,7 +399,7 @@ def _floaters(inputs: ReportInputs) -> VerdictLine | None:
     veil = inputs.read("evaluate.metrics").get("floaters", {}).get("veil", {})
     if veil.get("mean") is None:
         return None
-    level: Level = "good" if veil["mean"] <= VEIL else "doubt"
+    level: Level = "good" if veil["mean"] <= MAX_VEIL_SHARE else "doubt"
     what = "Few floaters" if level == "good" else "Floaters"
     which = "that training never saw" if veil.get("held_out", True) else "of the training, since none was held out"
     text = f"{what} in front of {plural(veil['photos'], 'photo')} {which}: they block"

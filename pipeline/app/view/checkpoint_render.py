@@ -35,11 +35,11 @@ from splatpipe.pipeline.web.viewer_scene import SPLAT, viewer_rendering, viewer_
 CHECKPOINT, RENDERING = "checkpoint.npz", "rendering.json"  # in the folder of a running training
 COARSE_SUMMARY = "coarse.json"  # in the folder of blocks not laid out yet: the coarse pass is done
 FROZEN = "frozen.ply"  # beside a block's checkpoint: the fixed Gaussians rendered around it
-COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # of a scene in blocks
+COARSE_MODEL, COARSE_SKY = "model.ply", "sky.npz"  # files of the coarse pass of a scene in blocks
 JPEG_QUALITY = 92
 SKY = "sky.colours"  # array of a checkpoint
-RENDER_BYTES = 1000  # of GPU memory per Gaussian: 236 for parameters, 201 for a frame, 8 pairs of 64
-LEFT_SHARE = 0.25  # of GPU memory kept free for training, which permanently reduces its use if it ever runs short
+RENDER_BYTES = 1000  # GPU memory per Gaussian: 236 for parameters, 201 for a frame, 8 pairs of 64
+LEFT_SHARE = 0.25  # GPU memory kept free for training, which permanently reduces its use if it ever runs short
 
 
 @dataclass(frozen=True)
@@ -202,11 +202,11 @@ def device_of(contents: Contents, logged: str) -> str:
     return str(machine.get("device", logged)) if isinstance(machine, Mapping) else logged
 
 
-def pictures(shown: LoadedModel, view: View, threads: int, device: str = "auto") -> tuple[bytes, bytes]:
+def pictures(loaded: LoadedModel, view: View, threads: int, device: str = "auto") -> tuple[bytes, bytes]:
     """JPEGs of a render and of its photo, both at training size, 2 megapixels at most.
 
     Args:
-        shown: The model.
+        loaded: The model.
         view: The photo.
         threads: CPU threads.
         device: The run's device: with ``cpu``, rendered on the CPU, else on the GPU if the training leaves enough
@@ -215,24 +215,24 @@ def pictures(shown: LoadedModel, view: View, threads: int, device: str = "auto")
     Raises:
         SplatpipeError: if the photo cannot be read.
     """
-    camera, photo, _ = reduced_view(view, min(JUDGED_MEGAPIXELS, shown.megapixels or JUDGED_MEGAPIXELS))
+    camera, photo, _ = reduced_view(view, min(JUDGED_MEGAPIXELS, loaded.megapixels or JUDGED_MEGAPIXELS))
     with same_bits(threads):
-        render = None if device == "cpu" else _render_on_gpu(shown, camera)
+        render = None if device == "cpu" else _render_on_gpu(loaded, camera)
         if render is None:
-            render = _render(shown, camera, cpu())
+            render = _render(loaded, camera, cpu())
     return _jpeg(render), _jpeg(photo)
 
 
-def _render_on_gpu(shown: LoadedModel, camera: Camera) -> Pixels | None:
+def _render_on_gpu(loaded: LoadedModel, camera: Camera) -> Pixels | None:
     """A render by the GPU; None without a GPU or with too little free memory."""
     try:
         device = choose_device("auto")
         if device.name == "cpu":
             return None
         free, whole = torch.cuda.mem_get_info(device.tensors)
-        if free - RENDER_BYTES * len(shown.gaussians) < LEFT_SHARE * whole:
+        if free - RENDER_BYTES * len(loaded.gaussians) < LEFT_SHARE * whole:
             return None
-        return _render(shown, camera, device)
+        return _render(loaded, camera, device)
     except (torch.OutOfMemoryError, MachineError):
         return None
     except RuntimeError as error:
@@ -244,15 +244,15 @@ def _render_on_gpu(shown: LoadedModel, camera: Camera) -> Pixels | None:
             torch.cuda.empty_cache()  # does nothing if CUDA was not used
 
 
-def _render(shown: LoadedModel, camera: Camera, device: Device) -> Pixels:
-    return render_pixels(placed((shown.gaussians, shown.sky), device), camera, shown.options)
+def _render(loaded: LoadedModel, camera: Camera, device: Device) -> Pixels:
+    return render_pixels(placed((loaded.gaussians, loaded.sky), device), camera, loaded.options)
 
 
-def viewer(shown: LoadedModel, source: ModelSource, contents: Contents, name: str) -> tuple[str, bytes]:
+def viewer(loaded: LoadedModel, source: ModelSource, contents: Contents, name: str) -> tuple[str, bytes]:
     """The 3D viewer's page of a model, and the splat file ``SPLAT`` that it loads from beside it.
 
     Args:
-        shown: The model.
+        loaded: The model.
         source: Its source.
         contents: The run.
         name: The run's name.
@@ -263,10 +263,10 @@ def viewer(shown: LoadedModel, source: ModelSource, contents: Contents, name: st
     if source.rendering is None or not {"georef.frame", "undistort.dataset"} <= set(contents.parts):
         raise SplatpipeError("There is nothing to show in 3D yet.")
     frame = load_frame(contents.parts["georef.frame"].path)
-    gaussians = in_world(shown.gaussians, frame)
-    rendering = viewer_rendering(shown.options, shown.sky)
+    gaussians = in_world(loaded.gaussians, frame)
+    rendering = viewer_rendering(loaded.options, loaded.sky)
     dataset, held_out = contents.parts["undistort.dataset"].path, set(held_out_of(contents))
-    title = f"{name}, iteration {shown.iteration:,}"
+    title = f"{name}, iteration {loaded.iteration:,}"
     scene = viewer_scene(dataset, frame, rendering, held_out, len(gaussians), title)
     return viewer_page(scene, SPLAT), viewer_splat(gaussians, scene.antialias)
 

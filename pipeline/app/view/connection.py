@@ -13,7 +13,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 REQUEST_S = 10.0  # for a request's head, and again for its body, which is at most 16 KiB
-MOST_WAITING = 32  # connections without a complete head: browsers keep six, some of them in advance
+MAX_WAITING = 32  # connections without a complete head: browsers keep six, some of them in advance
 
 
 class Connection(H11Protocol):
@@ -28,7 +28,7 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self._follow()
         waiting = [other for other in self.connections if isinstance(other, Connection) and other.is_waiting]
-        if len(waiting) > MOST_WAITING:
+        if len(waiting) > MAX_WAITING:
             longest_waiting(waiting).transport.close()
 
     def data_received(self, data: bytes) -> None:

@@ -21,10 +21,10 @@ from splatpipe.pipeline.app.view.access import Access, same
 
 HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")  # any port: a tunnel may use a different one
 PATH = re.compile(rb"/(?:\w[\w.-]*(?:/\w[\w.-]*)*)?", re.ASCII)
-LONGEST_PATH = 240
-LARGEST_BODY = 16 << 10
+MAX_PATH_LETTERS = 240
+MAX_BODY_BYTES = 16 << 10
 METHODS = ("GET", "HEAD", "POST")
-FOREIGN = ("cross-site", "same-site")  # of Sec-Fetch-Site: another site, or another port of this machine
+FOREIGN = ("cross-site", "same-site")  # values of Sec-Fetch-Site: another site, or another port of this machine
 FIRST_PAGE = "run"  # where an address without a path leads
 NO_KEY = (
     "Open the address that splatpipe view printed in the terminal where it runs, with its ?key=. Others are not shown"
@@ -122,7 +122,7 @@ class Guard:
         if scope["method"] not in METHODS:
             raise RefusedError(405, "Only GET, HEAD and POST are accepted.")
         path: bytes = scope.get("raw_path") or b""
-        if len(path) > LONGEST_PATH or PATH.fullmatch(path) is None:
+        if len(path) > MAX_PATH_LETTERS or PATH.fullmatch(path) is None:
             raise RefusedError(404, "Not found.")
         headers = Headers(scope=scope)
         has_body = headers.get("transfer-encoding") or headers.get("content-length", "0") != "0"
@@ -172,7 +172,7 @@ def _check_writing(headers: Headers) -> None:
     length = headers.get("content-length", "")
     if not (length.isascii() and length.isdigit()):
         raise RefusedError(411, "Content-Length is required.")
-    if int(length) > LARGEST_BODY:
+    if int(length) > MAX_BODY_BYTES:
         raise RefusedError(413, "The request is too large.")
 
 
@@ -190,7 +190,7 @@ async def _body(receive: Receive) -> bytes:
         if message["type"] != "http.request":
             raise RefusedError(400, "The request ended too early.")
         body += message.get("body", b"")
-        if len(body) > LARGEST_BODY:
+        if len(body) > MAX_BODY_BYTES:
             raise RefusedError(413, "The request is too large.")
         if not message.get("more_body"):
             return bytes(body)

@@ -16,7 +16,7 @@ from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE
 
 REPORT = "report.html"  # the only file for people in OUT that no stage delivers
 VIEWER = "viewer.html"
-LARGEST_METRICS = 4 << 20  # half a kilobyte for each of 8,000 views; parsed for each request, while others wait
+MAX_METRICS_BYTES = 4 << 20  # half a kilobyte for each of 8,000 views; parsed for each request, while others wait
 WHAT = {
     REPORT: "what was done, and the quality of the result",
     VIEWER: "the splat in 3D, in a single page",
@@ -30,7 +30,7 @@ WHAT = {
     "sparse.glb": "sparse points and camera frusta",
     "flythrough.webm": "a flight through the scene",
 }
-SHOWN_IN_BROWSER = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
+BROWSER_SUFFIXES = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
 
 
 def downloadable_files(run: RunFolder) -> tuple[str, ...]:
@@ -117,7 +117,7 @@ def _read_json(run: RunFolder, name: str) -> Mapping[str, JSON]:
     try:
         file = open_inside(run.out, name)
         with os.fdopen(file.descriptor, "rb") as stream:
-            found = parse_json(stream.read(LARGEST_METRICS))
+            found = parse_json(stream.read(MAX_METRICS_BYTES))
     except (FileNotServedError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
@@ -125,8 +125,8 @@ def _read_json(run: RunFolder, name: str) -> Mapping[str, JSON]:
 
 def _file(run: RunFolder, name: str) -> dict[str, Any]:
     size = (run.out / name).lstat().st_size
-    shown = PurePosixPath(name).suffix in SHOWN_IN_BROWSER
-    return {"name": name, "size": _bytes(size), "text": WHAT.get(name, ""), "shown": shown}
+    in_browser = PurePosixPath(name).suffix in BROWSER_SUFFIXES
+    return {"name": name, "size": _bytes(size), "text": WHAT.get(name, ""), "shown": in_browser}
 
 
 def _bytes(size: int) -> str:

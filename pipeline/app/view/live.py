@@ -141,10 +141,10 @@ class Live:
             return None
         if (source.stamp, number) in self._pictures:
             return self._pictures[source.stamp, number]
-        shown = self._load(source, contents)
-        if shown.megapixels is None:
-            shown = replace(shown, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
-        jpegs = checkpoint_render.pictures(shown, views[number], RENDER_THREADS, device)
+        loaded = self._load(source, contents)
+        if loaded.megapixels is None:
+            loaded = replace(loaded, megapixels=views[number].camera.width * views[number].camera.height / 1e6)
+        jpegs = checkpoint_render.pictures(loaded, views[number], RENDER_THREADS, device)
         self._pictures[source.stamp, number] = jpegs
         while len(self._pictures) > MAX_PICTURES:
             self._pictures.popitem(last=False)

@@ -15,9 +15,9 @@ from splatpipe.pipeline.engine.runs.run_folder import Contents, RunFolder
 from splatpipe.pipeline.engine.stage import JSON, shards_first, stage_name
 from splatpipe.stages.options import LineConfig
 
-LONGEST_LINE = 1 << 18
+MAX_LINE_BYTES = 1 << 18
 READ_AT_ONCE = 8 << 20
-MAX_POINTS = 2000  # of a curve: twice the width of a screen
+MAX_POINTS = 2000  # points in a curve: twice the width of a screen
 MAX_NOTES = 200
 RATE_WINDOW_S = 60.0  # for the estimate of the time left: iterations slow down as the model grows
 
@@ -141,7 +141,7 @@ class RunLog:
                     break
                 self._offset += len(chunk)
                 *lines, self._rest = (self._rest + chunk).split(b"\n")
-                self._rest = self._rest[: LONGEST_LINE + 1]
+                self._rest = self._rest[: MAX_LINE_BYTES + 1]
                 for line in lines:
                     self._process(line)
         finally:
@@ -149,7 +149,7 @@ class RunLog:
 
     def _process(self, line: bytes) -> None:
         """Process a line; invalid ones are skipped, since the log is not trusted."""
-        if len(line) > LONGEST_LINE:
+        if len(line) > MAX_LINE_BYTES:
             return
         event = parse_event(line)
         if event is None:

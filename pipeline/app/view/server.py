@@ -127,7 +127,7 @@ def _settings(app: ASGIApp) -> uvicorn.Config:
         log_level="error",
         access_log=False,
         server_header=False,
-        proxy_headers=False,  # of no proxy that we know: anyone could send them
+        proxy_headers=False,  # anyone could send them: we know no proxy
         timeout_graceful_shutdown=1,
         limit_concurrency=64,
     )

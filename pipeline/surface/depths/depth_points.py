@@ -19,7 +19,7 @@ from splatpipe.pipeline.surface.depths.sources import HeightRange
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
-SAME_PX = 10.0  # depths that bend by more than this many pixel widths are not one surface
+MAX_BEND_PX = 10.0  # depths that bend by more than this many pixel widths are not one surface
 REACHES = (3, 1)  # distances in pixels at which the slope for a normal is measured: at the shorter one, noise dominates
 
 
@@ -82,7 +82,7 @@ def pixel_normals(
     height, width = part.depth.shape
     here = part.depth[row, column].astype(np.float64)
     w = 1.0 / np.where(here > 0.0, here, np.inf)
-    near = w * (SAME_PX / max(part.camera.fx, part.camera.fy))
+    near = w * (MAX_BEND_PX / max(part.camera.fx, part.camera.fy))
     flat, slopes = here > 0.0, []
     for down, right in ((0, reach), (reach, 0)):
         inside = (row >= down) & (row + down < height) & (column >= right) & (column + right < width)

@@ -26,15 +26,15 @@ from splatpipe.pipeline.surface.depths.point_visibility import Points, classify_
 
 COMPARED_POINTS = 4000  # at which exposures are compared, whatever the size of the capture
 MAX_GAIN = 2.0  # and at least its inverse: more is not a difference in exposure
-MAX_SHADE = 0.5  # of a term, as a logarithm of light
-DARKEST, LIGHTEST = 8, 247  # values that are not clipped
+MAX_SHADE = 0.5  # largest coefficient of a shading term, as a logarithm of light
+MIN_VALUE, MAX_VALUE = 8, 247  # values that are not clipped
 PRIOR = 3.0  # weight, in points, that holds each photo at its own exposure,
 PRIOR_SHADING = 10.0  # and at the shading of all photos: corners determine a term better than the middle
 PRIOR_COMMON = 0.01  # times that weight for what all photos have in common
 HUBER = 0.15  # logarithm of light: larger differences between photos are weighted down
 ROUNDS = 4
 TOLERANCE = 1e-10  # relative to the right-hand side of the equations
-DIGITS = 5  # of gains: sums vary with the number of threads, but by much less
+DIGITS = 5  # decimals of gains: sums vary with the number of threads, but by much less
 
 Numbers = Int64[np.ndarray, " k"]
 
@@ -86,7 +86,7 @@ def _measure_light(
         return unseen
     pixels, _ = load_pixels(source)
     colour = sample_colours(source, pixels, points, seen, cell_m, PLAIN_TONE)
-    good = np.flatnonzero(seen & (colour >= DARKEST).all(axis=1) & (colour <= LIGHTEST).all(axis=1))
+    good = np.flatnonzero(seen & (colour >= MIN_VALUE).all(axis=1) & (colour <= MAX_VALUE).all(axis=1))
     terms = shading_terms(source.camera, place.column[good], place.row[good]).T
     return good, np.log(linear_light(colour[good] / 255.0)), terms
 

@@ -12,7 +12,7 @@ from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource, sample_
 from splatpipe.pipeline.surface.depths.point_visibility import Points, project_points
 
 SHADING_TERMS = 5  # terms of a photo's shading
-GAMMA = 2.4  # of sRGB above its darkest values: (value + offset) ** gamma is proportional to light
+GAMMA = 2.4  # exponent of sRGB above its darkest values: (value + offset) ** gamma is proportional to light
 OFFSET = 0.055 * 255.0
 
 

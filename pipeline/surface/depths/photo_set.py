@@ -24,7 +24,7 @@ from splatpipe.pipeline.surface.rasters.tiles import Tile
 SAMPLE_STEP = 4  # pixels, per axis, in the search for a tile's height range
 LAYER_M = 1.0  # thickness of a layer of heights, and the margin of the range
 MIN_PHOTOS = 2  # that have to see something in a layer
-MIN_COSINE = 0.1  # of the angle between a ray and a surface's normal: lower limit for flatter rays
+MIN_COSINE = 0.1  # lower limit for the cosine between a ray and the surface's normal, for flatter rays
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 
 from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource, load_pixels
 
-SHARE_OF_FREE = 0.5  # of the disk's free space at most: the files that are made need room, too
+SHARE_OF_FREE = 0.5  # share of the disk's free space that it may take: the files that are made need room, too
 
 
 @contextmanager

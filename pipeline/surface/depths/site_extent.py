@@ -23,12 +23,12 @@ from splatpipe.pipeline.surface.depths.sources import MIN_CONFIRMED, DepthSource
 
 SAMPLES = 3000  # evenly spaced depths per photo
 CELL_GSD = 100.0  # plan cell size in GSDs, such that each cell that a photo sees has several of its samples
-MAX_CELLS = 1 << 24  # of the plan: 60 km² at a GSD of 2 cm, and 0.5 GB
+MAX_CELLS = 1 << 24  # largest plan: 60 km² at a GSD of 2 cm, and 0.5 GB
 MIN_PHOTOS = 3  # photos that have to see a cell
-DISTANT = 4.0  # pixels more than this many times as large on the ground as usual show distant land, not the site
-MIN_PART = 0.02  # of the area seen: smaller isolated parts are left out
-NOISE = 0.001  # share of the lowest and of the highest samples that may be wrong
-MARGIN = 0.1  # of the relief, below and above, for what the samples missed,
+MAX_PIXEL_TIMES = 4.0  # times the usual size on the ground: larger pixels show distant land, not the site
+MIN_PART_SHARE = 0.02  # share of the area seen below which an isolated part is left out
+OUTLIER_SHARE = 0.001  # share of the lowest and of the highest samples that may be wrong
+RELIEF_MARGIN_SHARE = 0.1  # share of the relief added below and above, for what the samples missed,
 MIN_MARGIN_M = 3.0  # but at least this: a mast or a well
 
 
@@ -129,7 +129,7 @@ def measure_extent(
     gsd = float(np.mean([np.median(sample[:, 4]) for sample in seen]))
     number = np.repeat(np.arange(len(samples)), [len(sample) for sample in samples])
     every = np.concatenate(samples)
-    near = every[:, 3] <= DISTANT * gsd
+    near = every[:, 3] <= MAX_PIXEL_TIMES * gsd
     if area is not None:
         near &= area.contains(every[:, :3])
     every, number = every[near], number[near]
@@ -177,11 +177,12 @@ def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) ->
     _, parts = cv2.connectedComponents(covered, connectivity=8)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    kept = sizes >= min(MIN_PART * sizes.sum(), sizes.max())  # the largest one, even if the site is in many pieces
+    # The largest one is kept even if the site is in many pieces.
+    kept = sizes >= min(MIN_PART_SHARE * sizes.sum(), sizes.max())
     return np.asarray((covered > 0) & kept[parts])
 
 
 def _relief(up: Float64[np.ndarray, " n"]) -> tuple[float, float]:
-    low, high = np.quantile(up, [NOISE, 1.0 - NOISE])
-    margin = max(MIN_MARGIN_M, MARGIN * (high - low))
+    low, high = np.quantile(up, [OUTLIER_SHARE, 1.0 - OUTLIER_SHARE])
+    margin = max(MIN_MARGIN_M, RELIEF_MARGIN_SHARE * (high - low))
     return float(low - margin), float(high + margin)

@@ -41,7 +41,7 @@ class PosedDepthMap(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MetricMap:
-    """A ``PosedDepthMap`` in local metres or in a sheet's frame."""
+    """A ``PosedDepthMap`` in local metres or in a plane's frame."""
 
     camera: Camera
     depth: Float32[np.ndarray, "h w"]

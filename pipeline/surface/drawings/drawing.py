@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-PAPER_MM = (380.0, 240.0)  # of an A3 sheet, what a drawing may fill
-SCALES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000)  # of plans, as offices use them
-BAR_MM = 60.0  # of a scale bar on paper, at most
+PAPER_MM = (380.0, 240.0)  # area on an A3 page that a drawing may fill
+SCALES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000)  # denominators used for plans
+BAR_MM = 60.0  # longest scale bar on paper
 BAR_LENGTHS_M = tuple(base * 10.0**power for power in range(-1, 5) for base in (1.0, 2.0, 5.0))
 BAR_PARTS = 4
 TEXT_MM, TITLE_MM = 2.5, 5.0  # ISO 3098's heights of letters

@@ -34,7 +34,7 @@ from splatpipe.pipeline.surface.drawings.dxf import DxfDocument, TextEntityAlign
 
 DXF_VERSION = "R2000"  # the oldest with drawing units and images, so most programs read it
 METRES = 6  # value of $INSUNITS
-DIGITS = 4  # of coordinates in metres: a tenth of a millimetre
+DIGITS = 4  # decimals of coordinates in metres: a tenth of a millimetre
 MARGIN_MM = 10.0  # around an SVG, with room for texts that extend beyond lines
 MAX_EMBEDDED = 4096  # largest side of an image in an SVG, pixels; larger images are reduced
 JPEG_QUALITY = 92

@@ -11,11 +11,11 @@ from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.surface.drawings.drawing import Drawing
 from splatpipe.pipeline.surface.drawings.drawing_files import LAYERS, MARGIN_MM
 
-DOTS_PER_INCH = 150  # of paper: a page fills a screen
+DOTS_PER_INCH = 150  # resolution on paper: a page fills a screen
 MM_AN_INCH, POINTS_A_MM = 25.4, 72.0 / 25.4
 LETTER = 1.4  # a font's size over its capitals' height
-DOT_MM = 0.6  # of a point
-MIN_MM, MAX_MM = 60.0, 600.0  # of a side, whatever is drawn
+DOT_MM = 0.6  # diameter of a point on paper
+MIN_MM, MAX_MM = 60.0, 600.0  # shortest and longest side on paper, whatever is drawn
 TEXT_ROOM_MM = 25.0  # for what is written below and at the left
 
 

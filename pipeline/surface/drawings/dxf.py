@@ -16,7 +16,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.files.output_file import write_file
 
 FOLDERS = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")  # variables of where it reads and writes
-NO_FONTS = '{"version": 2, "font-faces": []}'  # of another version, it would search for fonts
+NO_FONTS = '{"version": 2, "font-faces": []}'  # ezdxf's font cache: with another version, it would search for fonts
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Elevations of walls: orthographic views, with the distance of each point in front of or behind the wall's plane.
 
-A wall is a vertical sheet. The surface model over it, with the surface nearest to the viewer as the topmost, gives the
+A wall is a vertical plane. The surface model over it, with the surface nearest to the viewer as the topmost, gives the
 depths, and the orthophoto the colours. Objects in front of the wall beyond the height range are left out, and not
 projected onto it: areas that they hide are coloured from photos that see past them, or not at all.
 """
@@ -27,43 +27,43 @@ from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.sheets.raster_plane import RasterPlane
 
 BEHIND_M, BEFORE_M = 0.6, 0.6  # extent of a wall's details: reveals and doors, sills and cornices, but not balconies
-MAX_CELLS = 100_000_000  # of an elevation: 300 m by 20 m at 8 mm; it takes 2 GB
+MAX_CELLS = 100_000_000  # largest elevation: 300 m by 20 m at 8 mm; it takes 2 GB
 STRIP = 256  # rows that are filtered at a time
-CACHE_BYTES = 256 << 20  # of photos, and as many of depths
+CACHE_BYTES = 256 << 20  # memory for photos, and as much for depths
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Elevation:
-    """A wall seen from the front; its rasters lie on the sheet's lattice.
+    """A wall seen from the front; its rasters lie on the plane's lattice.
 
     Attributes:
         wall: The wall.
-        sheet: Its frame: x from the wall's left end, y up as in the local frame, z towards the viewer, metres.
+        plane: Its frame: x from the wall's left end, y up as in the local frame, z towards the viewer, metres.
         depth: Metres in front of the plane, NaN where unknown.
         sigma: Expected deviation of each depth, metres.
         colour: Red, green, blue, alpha: 0 where there is no colour.
     """
 
     wall: Wall
-    sheet: RasterPlane
+    plane: RasterPlane
     depth: Float32[np.ndarray, "h w"]
     sigma: Float32[np.ndarray, "h w"]
     colour: UInt8[np.ndarray, "h w 4"]
 
     def corners(self) -> Float64[np.ndarray, "4 3"]:
         """Upper left, upper right, lower right, lower left of the raster, in the plane; local metres."""
-        lattice = self.sheet.lattice
+        lattice = self.plane.lattice
         left, top = lattice.east_m, lattice.north_m
         right, bottom = left + lattice.width * lattice.cell_m, top - lattice.height * lattice.cell_m
-        return self.sheet.local_from_sheet(
+        return self.plane.local_from_plane(
             np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]])
         )
 
 
-def wall_sheet(wall: Wall, cell_m: float) -> RasterPlane:
-    """The sheet of a wall: whole cells from end to end and from top to foot, with any excess split between both sides.
+def wall_plane(wall: Wall, cell_m: float) -> RasterPlane:
+    """The plane of a wall: whole cells from end to end and from top to foot, with any excess split between both sides.
 
     Args:
         wall: The wall.
@@ -112,33 +112,33 @@ def draw_elevation(wall: Wall, cell_m: float, photos: ElevationPhotos, progress:
         progress: Called with the number of finished tiles and of all tiles.
 
     Raises:
-        SplatpipeError: as ``wall_sheet``.
+        SplatpipeError: as ``wall_plane``.
     """
-    sheet = wall_sheet(wall, cell_m)
-    depths_tiles, colour_tiles = (list(sheet.lattice.tiles(side)) for side in (HEIGHTS_TILE, TILE))
+    plane = wall_plane(wall, cell_m)
+    depths_tiles, colour_tiles = (list(plane.lattice.tiles(side)) for side in (HEIGHTS_TILE, TILE))
     total = len(depths_tiles) + len(colour_tiles)
-    sources, levels = _photos_in_front(sheet, photos)
-    shape = sheet.lattice.height, sheet.lattice.width
+    sources, levels = _photos_in_front(plane, photos)
+    shape = plane.lattice.height, plane.lattice.width
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     colour = np.zeros((*shape, 4), np.uint8)
     cache: LruCache[PosedDepthMap] = LruCache(CACHE_BYTES)
     known = [source.depths for source in sources if source.depths is not None]
-    capture = HeightInput(known, sheet.lattice, sheet.relief, cache, upright=True)
+    capture = HeightInput(known, plane.lattice, plane.relief, cache, upright=True)
     for done, part in enumerate(surface_heights(capture, depths_tiles, photos.threads), 1):
         cut = part.tile.slices
         depth[cut], sigma[cut] = part.height, part.sigma
         progress(done, total)
     depth = remove_specks(depth)
-    surface = HeightField(sheet.lattice, depth)
+    surface = HeightField(plane.lattice, depth)
     album = OrthoInput(
-        sources, surface, sheet.lattice, sheet.relief, levels, LruCache(CACHE_BYTES), LruCache(CACHE_BYTES)
+        sources, surface, plane.lattice, plane.relief, levels, LruCache(CACHE_BYTES), LruCache(CACHE_BYTES)
     )
     for done, drawn in enumerate(orthophotos(album, colour_tiles, photos.threads), len(depths_tiles) + 1):
         cut = drawn.tile.slices
         colour[(*cut, slice(0, 3))] = drawn.colour
         colour[(*cut, 3)] = np.where(drawn.known, np.uint8(255), np.uint8(0))
         progress(done, total)
-    return Elevation(wall, sheet, depth, sigma, colour)
+    return Elevation(wall, plane, depth, sigma, colour)
 
 
 def remove_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -155,11 +155,11 @@ def remove_specks(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
     return result
 
 
-def _photos_in_front(sheet: RasterPlane, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
-    """Photos in front of a wall, in its sheet's frame, with their exposure gains."""
+def _photos_in_front(plane: RasterPlane, photos: ElevationPhotos) -> tuple[list[PhotoSource], PhotoGains]:
+    """Photos in front of a wall, in its plane's frame, with their exposure gains."""
     rows = [
         row
         for row, source in enumerate(photos.sources)
-        if sheet.sheet_from_local(source.camera.centre())[2] > sheet.relief.high_m
+        if plane.plane_from_local(source.camera.centre())[2] > plane.relief.high_m
     ]
-    return [sheet.transform_photo(photos.sources[row]) for row in rows], photos.levels.of(rows)
+    return [plane.transform_photo(photos.sources[row]) for row in rows], photos.levels.of(rows)

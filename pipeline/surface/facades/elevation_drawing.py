@@ -23,7 +23,7 @@ from splatpipe.pipeline.surface.facades.elevation import Elevation
 from splatpipe.pipeline.surface.facades.openings import outlines, projections, recesses
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 
-TICK_MM = 4.0  # of a level's mark
+TICK_MM = 4.0  # length of a level's mark on paper
 
 
 def elevation_drawing(elevation: Elevation, crs: MapCrs, zero_m: float, picture: str) -> Drawing:
@@ -35,16 +35,16 @@ def elevation_drawing(elevation: Elevation, crs: MapCrs, zero_m: float, picture:
         zero_m: Result of ``height_zero_m``.
         picture: Name of the image file.
     """
-    wall, sheet = elevation.wall, elevation.sheet
-    lattice = sheet.lattice
+    wall, plane = elevation.wall, elevation.plane
+    lattice = plane.lattice
     low, high = wall.low_m + zero_m, wall.high_m + zero_m
     width_m, height_m = lattice.width * lattice.cell_m, lattice.height * lattice.cell_m
     scale = plot_scale(width_m, height_m)
     strokes = [Stroke(EXTENT, rectangle(0.0, low, wall.length_m, high), closed=True)]
     for layer, rings in (
-        (OUTLINE, outlines(elevation.depth, sheet)),
-        (OPENINGS, recesses(elevation.depth, sheet)),
-        (PROJECTIONS, projections(elevation.depth, sheet)),
+        (OUTLINE, outlines(elevation.depth, plane)),
+        (OPENINGS, recesses(elevation.depth, plane)),
+        (PROJECTIONS, projections(elevation.depth, plane)),
     ):
         strokes += [Stroke(layer, ring + np.array([0.0, zero_m]), closed=True) for ring in rings]
     levels, marks = _levels(low, high, scale)

@@ -25,8 +25,8 @@ from splatpipe.pipeline.surface.rasters.geotiff import GDAL_ERRORS, NODATA_HEIGH
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 
 FORMAT = 1
-METRE_DIGITS = 4  # of lengths and coordinates in the JSON: a tenth of a millimetre
-LIKELY = 0.95  # the higher of the two quantiles of standard deviations that are reported
+METRE_DIGITS = 4  # decimals of lengths and coordinates in the JSON: a tenth of a millimetre
+REPORTED_QUANTILE = 0.95  # the higher of the two quantiles of standard deviations that are reported
 
 
 def height_zero_m(elevation: Elevation, crs: MapCrs) -> float:
@@ -46,7 +46,7 @@ def write_depth(path: Path, elevation: Elevation, zero_m: float) -> None:
     Raises:
         MachineError: if the disk is full or not writable.
     """
-    lattice = elevation.sheet.lattice
+    lattice = elevation.plane.lattice
     cell = lattice.cell_m
     profile = {
         "driver": "GTiff",
@@ -83,10 +83,12 @@ def elevation_facts(elevation: Elevation, crs: MapCrs, files: dict[str, str]) ->
         crs: CRS of its corners.
         files: Names of its files beside the JSON, by ``depth``, ``picture``, ``dxf``, ``svg``.
     """
-    wall, lattice = elevation.wall, elevation.sheet.lattice
+    wall, lattice = elevation.wall, elevation.plane.lattice
     known = np.isfinite(elevation.depth)
     sigma = elevation.sigma[known]
-    spread = [None, None] if not sigma.size else [_rounded(float(np.quantile(sigma, q))) for q in (0.5, LIKELY)]
+    spread = (
+        [None, None] if not sigma.size else [_rounded(float(np.quantile(sigma, q))) for q in (0.5, REPORTED_QUANTILE)]
+    )
     return {
         "name": wall.name,
         "corners": _listed(crs.crs_from_local(elevation.corners())),
@@ -98,8 +100,8 @@ def elevation_facts(elevation: Elevation, crs: MapCrs, files: dict[str, str]) ->
         "height_m": _rounded(wall.high_m - wall.low_m),
         "area_m2": _rounded(wall.area_m2),
         "plane": _plane(elevation, crs),
-        "behind_plane_m": -elevation.sheet.relief.low_m,
-        "before_plane_m": elevation.sheet.relief.high_m,
+        "behind_plane_m": -elevation.plane.relief.low_m,
+        "before_plane_m": elevation.plane.relief.high_m,
         "share_with_depth": _rounded(float(known.mean())),
         "share_with_colour": _rounded(float((elevation.colour[..., 3] > 0).mean())),
         "depth_sigma_median_m": spread[0],

@@ -34,7 +34,7 @@ from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, open_map
 
 LIST = "facades.json"
 ENDINGS = {"depth": ".tif", "picture": ".png", "dxf": ".dxf", "svg": ".svg"}
-LONGEST_TEXT = 10_000  # characters of stated lines
+MAX_TEXT_LETTERS = 10_000  # characters of stated lines
 Line = tuple[float, float, float, float]
 
 
@@ -113,7 +113,7 @@ def parse_lines(text: str) -> list[Line]:
     Raises:
         UsageError: if the text has another form.
     """
-    if len(text) > LONGEST_TEXT:
+    if len(text) > MAX_TEXT_LETTERS:
         raise UsageError(f"{len(text):,} characters of lines are too many.", hint="Draw them in several runs.")
     lines: list[Line] = []
     for part in text.split(";") if text.strip() else ():

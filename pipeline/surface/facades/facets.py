@@ -15,12 +15,12 @@ from splatpipe.pipeline.surface.depths.sources import MIN_CONFIRMED, DepthSource
 
 BLOCKS_PER_PHOTO = 20_000  # blocks of pixels, each fitted with a plane: 20 cm of a wall in photos with a GSD of 3 cm
 MIN_BLOCK = 6  # pixels per side: a smaller block's slope is noise
-MIN_SHARE = 0.6  # of a block's pixels that count
-ROUGH_PX = 3.0  # pixel widths by which a block's depths may scatter about its plane: more means two surfaces
-UPRIGHT = 0.35  # largest vertical component of a normal: 20°, three standard deviations for a small block
-COARSEST = 2.0  # times the median pixel: coarser pixels show houses beyond the survey area
+MIN_SHARE = 0.6  # share of a block's pixels that need a confirmed depth
+MAX_SCATTER_PX = 3.0  # pixel widths by which a block's depths may scatter about its plane: more means two surfaces
+MAX_NORMAL_UP = 0.35  # largest vertical component of a normal: 20°, three standard deviations for a small block
+MAX_PIXEL_TIMES = 2.0  # times the median pixel: coarser pixels show houses beyond the survey area
 STRIP_PIXELS = 1 << 20  # fitted at a time: about 100 MB
-MAX_FACETS = 1_000_000  # of all photos; more are thinned evenly
+MAX_FACETS = 1_000_000  # kept in all photos together; more are thinned evenly
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def upright_facets(sources: Sequence[DepthSource], threads: int) -> Facets:
         return found.select(np.arange(0, len(found), share))
 
     every = _concatenate(list(ordered_map(load_facets, sources, threads)))
-    return every.select(every.pixels_m <= COARSEST * np.median(every.pixels_m)) if len(every) else every
+    return every.select(every.pixels_m <= MAX_PIXEL_TIMES * np.median(every.pixels_m)) if len(every) else every
 
 
 def facets_of(found: PosedDepthMap) -> Facets:
@@ -94,7 +94,7 @@ def _strip_facets(found: PosedDepthMap, top: int, rows: int, side: int) -> Facet
     middle = (weight[..., None] * terms).sum(axis=1) / total[:, None]
     w = (middle * normal).sum(axis=1)
     rough = np.sqrt((weight * misfit).sum(axis=1) / total)
-    good = (w > 0.0) & (rough * camera.fx <= ROUGH_PX * w)
+    good = (w > 0.0) & (rough * camera.fx <= MAX_SCATTER_PX * w)
     return _upright_only(camera, middle[good], normal[good], side)
 
 
@@ -145,5 +145,5 @@ def _upright_only(
     pixels_m = 1.0 / (w * math.sqrt(camera.fx * camera.fy))
     areas = np.square(side * pixels_m) * length / w  # over the cosine against the view axis, as pixels are counted
     plan = np.linalg.norm(towards[:, :2], axis=1)
-    kept = np.abs(towards[:, 2]) <= UPRIGHT
+    kept = np.abs(towards[:, 2]) <= MAX_NORMAL_UP
     return Facets(places[kept], towards[kept, :2] / plan[kept, None], areas[kept], pixels_m[kept])

@@ -10,39 +10,40 @@ from splatpipe.pipeline.surface.sheets.raster_plane import RasterPlane
 
 RECESS_M, JUT_M = 0.05, 0.12  # behind the plane: window frames; in front of it: canopies, not shutters and plinths
 STEP_GSD = 2.0  # and at least this many pixels: depths of coarse photos scatter more
-MIN_AREA_M2 = 0.15  # of an opening; smaller ones are vents and noise
-SOFT_M = 0.06  # narrower notches and spots of a mask are removed
+MIN_AREA_M2 = 0.15  # smallest opening; smaller ones are vents and noise
+MIN_NOTCH_M = 0.06  # narrower notches and spots of a mask are removed
 BRIDGED_M = 1.2  # narrower notches in the wall's outline, e.g. by bushes in front of it, are closed
-STRAIGHT_CELLS = 1.5  # tolerance of a simplified outline
-ENCLOSED, RIM_CELLS = (
+OUTLINE_TOLERANCE_CELLS = 1.5  # tolerance of a simplified outline
+MIN_ENCLOSED_SHARE, RIM_CELLS = (
     0.5,
     3,
 )  # least share of the wall's face in the cells around an opening: around a roof, it is small
-SQUARE = 0.8  # share of its level rectangle that an opening fills to be drawn as one; a round window fills 0.79
+# Share of its level rectangle that an opening fills to be drawn as one; a round window fills 0.79.
+MIN_RECTANGLE_SHARE = 0.8
 Ring = Float64[np.ndarray, "_ 2"]
 
 
-def recesses(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
-    """Outlines of openings (areas behind the plane surrounded by the wall's face) on the sheet, metres."""
-    limit = max(RECESS_M, STEP_GSD * sheet.lattice.cell_m)
+def recesses(depth: Float32[np.ndarray, "h w"], plane: RasterPlane) -> list[Ring]:
+    """Outlines of openings (areas behind the plane surrounded by the wall's face) on the plane, metres."""
+    limit = max(RECESS_M, STEP_GSD * plane.lattice.cell_m)
     face = np.isfinite(depth) & (np.nan_to_num(depth, nan=-np.inf) >= -limit)
-    return _rings(np.nan_to_num(depth, nan=0.0) < -limit, sheet, face)
+    return _rings(np.nan_to_num(depth, nan=0.0) < -limit, plane, face)
 
 
-def projections(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
-    """Outlines of parts that project from the plane, likewise."""
-    limit = max(JUT_M, STEP_GSD * sheet.lattice.cell_m)
-    return _rings(np.nan_to_num(depth, nan=0.0) > limit, sheet, None)
+def projections(depth: Float32[np.ndarray, "h w"], plane: RasterPlane) -> list[Ring]:
+    """Outlines of parts that project from the plane, metres."""
+    limit = max(JUT_M, STEP_GSD * plane.lattice.cell_m)
+    return _rings(np.nan_to_num(depth, nan=0.0) > limit, plane, None)
 
 
-def outlines(depth: Float32[np.ndarray, "h w"], sheet: RasterPlane) -> list[Ring]:
+def outlines(depth: Float32[np.ndarray, "h w"], plane: RasterPlane) -> list[Ring]:
     """Outlines of the known wall, with small holes and notches closed."""
     known = np.isfinite(depth).astype(np.uint8)
-    reach = round(BRIDGED_M / sheet.lattice.cell_m)
+    reach = round(BRIDGED_M / plane.lattice.cell_m)
     wide = cv2.copyMakeBorder(known, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
     closed = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _square(reach)))
     height, width = known.shape
-    return _rings(closed[reach : reach + height, reach : reach + width] > 0, sheet, None)
+    return _rings(closed[reach : reach + height, reach : reach + width] > 0, plane, None)
 
 
 def _square(cells: int) -> UInt8[np.ndarray, "k k"]:
@@ -51,17 +52,17 @@ def _square(cells: int) -> UInt8[np.ndarray, "k k"]:
     return np.ones((side, side), np.uint8)
 
 
-def _rings(there: Bool[np.ndarray, "h w"], sheet: RasterPlane, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
+def _rings(there: Bool[np.ndarray, "h w"], plane: RasterPlane, face: Bool[np.ndarray, "h w"] | None) -> list[Ring]:
     """Outlines of connected parts, along the cells' borders, from the largest.
 
     Args:
         there: Mask to outline.
-        sheet: The sheet with its cells.
+        plane: The plane with its cells.
         face: The wall's face, which has to surround openings; openings that are nearly level rectangles are drawn as
             such. None if the parts are not openings.
     """
-    cell = sheet.lattice.cell_m
-    kernel = _square(round(SOFT_M / cell))
+    cell = plane.lattice.cell_m
+    kernel = _square(round(MIN_NOTCH_M / cell))
     mask = np.asarray(cv2.morphologyEx(there.astype(np.uint8), cv2.MORPH_OPEN, kernel))
     mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
     count, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
@@ -72,11 +73,11 @@ def _rings(there: Bool[np.ndarray, "h w"], sheet: RasterPlane, face: Bool[np.nda
             break
         left, top, width, height = (int(stats[part, k]) for k in range(4))
         own = parts[top : top + height, left : left + width] == part
-        if face is not None and _enclosed(own, left, top, face) < ENCLOSED:
+        if face is not None and _enclosed(own, left, top, face) < MIN_ENCLOSED_SHARE:
             continue
-        ring = _level_rectangle(own) if face is not None and own.mean() >= SQUARE else _trace_outline(own)
+        ring = _level_rectangle(own) if face is not None and own.mean() >= MIN_RECTANGLE_SHARE else _trace_outline(own)
         columns, rows = (ring + np.array([left, top])).T
-        rings.append(np.column_stack([sheet.lattice.east_m + columns * cell, sheet.lattice.north_m - rows * cell]))
+        rings.append(np.column_stack([plane.lattice.east_m + columns * cell, plane.lattice.north_m - rows * cell]))
     return rings
 
 
@@ -103,5 +104,5 @@ def _trace_outline(own: Bool[np.ndarray, "h w"]) -> Ring:
     fine = np.pad(np.kron(own.view(np.uint8), np.ones((2, 2), np.uint8)), 1)
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(found, key=len)
-    corners = np.asarray(cv2.approxPolyDP(longest, 2.0 * STRAIGHT_CELLS, True)).reshape(-1, 2)
+    corners = np.asarray(cv2.approxPolyDP(longest, 2.0 * OUTLINE_TOLERANCE_CELLS, True)).reshape(-1, 2)
     return (corners - 0.5) / 2.0

@@ -20,27 +20,28 @@ from splatpipe.pipeline.survey.boundary import DIRECTIONS
 SEED_M, SEED_SECTORS = 1.0, 24  # bins of plan and of direction whose facets seed the search for walls
 SEED_M2 = 2.0  # least area of a seed's facets, of all photos together
 SEED_HEIGHT_M = 1.2  # least height of the facets in a seed's plane; half a wall's
-SAME_WAY = math.cos(math.radians(30.0))  # of a facet's and its wall's direction: three times a facet's noise
+NORMAL_COSINE = math.cos(math.radians(30.0))  # between a facet's and its wall's normal: three times a facet's noise
 REACHES_M = (1.5, 4.0, 12.0, 40.0, 1e6)  # lengths to which a wall grows step by step, each with a new fit of its plane
 BAND_M = 0.12  # on either side of a plane: includes plinths and shutters, but not window panes
-BAND_PIXELS = 4.0  # the same for coarse depths
+BAND_PIXELS = 4.0  # least half width of the band, in pixels on the wall, for coarse depths
 CLAIM_BANDS = 4.0  # about a wall, within which no other wall is searched for...
-CLAIM_COSINE = 0.5  # ...in nearly the same direction: noise turns some of its own facets by more than ``SAME_WAY``
+CLAIM_COSINE = 0.5  # ...in nearly the same direction: noise turns some of its own facets by more than ``NORMAL_COSINE``
 BIN_M = 0.5  # along a wall
 GAP_M = 3.0  # between pieces of one wall: a tree in front of it, a gate
-CELL_M = 0.25  # of a wall's face, occupied if it has three facets
+CELL_M = 0.25  # side of a cell of a wall's face, occupied if it has three facets
 CELL_FACETS = 3
-CLOSED_CELLS = 5  # openings up to this size are bridged
-MIN_HEIGHT_M, MIN_LENGTH_M, MIN_AREA_M2 = 2.1, 2.0, 6.0  # of a wall that meets others: garden walls are lower
-FREE_HEIGHT_M = 2.8  # of one that meets no other: vans are lower
-LOW_FLAT = 0.22  # of the band, within which half of the facets of a wall lower than that have to lie: on the demo, half
+BRIDGED_CELLS = 5  # openings up to this size are bridged
+# Least size of a wall that meets others: garden walls are lower.
+MIN_HEIGHT_M, MIN_LENGTH_M, MIN_AREA_M2 = 2.1, 2.0, 6.0
+FREE_HEIGHT_M = 2.8  # least height of a wall that meets no other: vans are lower
+LOW_WALL_BAND_SHARE = 0.22  # share of the band in which half of a low wall's facets have to lie: on the demo, half
 # lie within 0.04 for low walls, 0.18 for walls with a plinth, and 0.3 to 0.4 for hedges clipped as high as garages
-MIN_FLAT = 0.6  # share of the facets around a wall's plane that lie within its band: in hedges and trees they scatter
+MIN_BAND_SHARE = 0.6  # share of the facets around a wall's plane within its band: in hedges and trees they scatter
 CORNER_M = 0.4  # from where a wall's facets end to the plane of the next one, at most: two facets
 CORNER_COSINE = math.cos(math.radians(30.0))  # planes that meet at less than this angle make no corner
 TOP_M = 0.4  # above the last facets, which end two of them below the eaves
-END_SHARE = 0.4  # of a wall's usual height that has to be seen at its ends: anything lower is a bush or a fence
-ROUNDS = 5  # of a plane's robust fit
+MIN_END_HEIGHT_SHARE = 0.4  # height seen at a wall's end over its usual height: anything lower is a bush or a fence
+ROUNDS = 5  # iterations of a plane's robust fit
 
 Plan = Float64[np.ndarray, " 2"]
 
@@ -221,12 +222,12 @@ def _grow_plane(
     return line, ends
 
 
-def _near(facets: Facets, line: _Line, band_m: float, cosine: float = SAME_WAY) -> Bool[np.ndarray, " n"]:
+def _near(facets: Facets, line: _Line, band_m: float, cosine: float = NORMAL_COSINE) -> Bool[np.ndarray, " n"]:
     return np.asarray((np.abs(line.off(facets)) < band_m) & (facets.facing @ line.facing > cosine))
 
 
 def _around(
-    facets: Facets, line: _Line, ends: tuple[float, float], band_m: float, cosine: float = SAME_WAY
+    facets: Facets, line: _Line, ends: tuple[float, float], band_m: float, cosine: float = NORMAL_COSINE
 ) -> Bool[np.ndarray, " n"]:
     along = facets.places[:, :2] @ line.along
     return np.asarray(_near(facets, line, band_m, cosine) & (along >= ends[0]) & (along <= ends[1]))
@@ -295,7 +296,7 @@ def _face(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float)
     kept = (inner == best) & (count[row, column] >= CELL_FACETS)
     half = np.sqrt(some.areas) / 2.0
     tall = ((count >= CELL_FACETS) & (parts == best)).sum(axis=0)
-    high = kept & (tall[column] >= END_SHARE * np.median(tall[tall > 0]))
+    high = kept & (tall[column] >= MIN_END_HEIGHT_SHARE * np.median(tall[tall > 0]))
     reached = (float((along - half)[high].min()), float((along + half)[high].max()))
     heights = (float((up - half)[kept].min()), float((up + half)[kept].max()))
     return _Face(reached, heights, float(sizes[best]) * CELL_M**2)
@@ -304,10 +305,10 @@ def _face(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float)
 def _connected(there: Bool[np.ndarray, "h w"]) -> Int64[np.ndarray, "h w"]:
     """Labels of connected parts, with openings and gaps bridged; 0 where there is nothing."""
     across = 2 * round(GAP_M / CELL_M / 2.0) + 1
-    wide = np.pad(there.astype(np.uint8), ((CLOSED_CELLS, CLOSED_CELLS), (across, across)))
-    wide = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((CLOSED_CELLS, across), np.uint8)))
+    wide = np.pad(there.astype(np.uint8), ((BRIDGED_CELLS, BRIDGED_CELLS), (across, across)))
+    wide = np.asarray(cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((BRIDGED_CELLS, across), np.uint8)))
     parts = np.asarray(cv2.connectedComponents(wide, connectivity=8)[1])
-    return parts[CLOSED_CELLS : len(parts) - CLOSED_CELLS, across:-across].astype(np.int64)
+    return parts[BRIDGED_CELLS : len(parts) - BRIDGED_CELLS, across:-across].astype(np.int64)
 
 
 def _piece(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float) -> _Piece | None:
@@ -320,9 +321,9 @@ def _piece(facets: Facets, line: _Line, ends: tuple[float, float], band_m: float
     around = facets.areas[_around(facets, line, face.ends, CLAIM_BANDS * band_m)].sum()
     flat = facets.select(_around(facets, line, face.ends, band_m))
     is_low = face.heights[1] - face.heights[0] < FREE_HEIGHT_M
-    if is_low and np.median(np.abs(line.off(flat))) > LOW_FLAT * band_m:
+    if is_low and np.median(np.abs(line.off(flat))) > LOW_WALL_BAND_SHARE * band_m:
         return None
-    return _Piece(line, face.ends, face.heights) if flat.areas.sum() >= MIN_FLAT * around else None
+    return _Piece(line, face.ends, face.heights) if flat.areas.sum() >= MIN_BAND_SHARE * around else None
 
 
 def _join_corners(pieces: Sequence[_Piece]) -> list[_Piece]:

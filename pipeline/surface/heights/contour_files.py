@@ -24,12 +24,12 @@ from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, unit_name
 
 DXF_VERSION = "R2000"
-DXF_UNITS = {"metre": 6, "foot": 2, "US survey foot": 21}  # of $INSUNITS
+DXF_UNITS = {"metre": 6, "foot": 2, "US survey foot": 21}  # codes of the header variable $INSUNITS
 LAYER, INDEX_LAYER = "CONTOURS", "CONTOURS_INDEX"
 LINE_WEIGHTS = {LAYER: 13, INDEX_LAYER: 35}  # hundredths of a millimetre
 LAYER_COLOURS = {LAYER: 8, INDEX_LAYER: 7}  # AutoCAD's grey; black or white, depending on the background
 DEGREE_DIGITS = 9  # a tenth of a millimetre
-UNIT_DIGITS = 4  # the same, of metres and feet
+UNIT_DIGITS = 4  # decimals of metres and feet: a tenth of a millimetre, or less
 
 
 def write_geojson(path: Path, contours: Contours, grid: Grid) -> None:

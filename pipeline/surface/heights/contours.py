@@ -28,9 +28,10 @@ MAX_AUTO_LEVELS = 100  # over the relief, with an automatic interval
 MAX_LEVELS = 10_000  # with a given interval
 MAX_VERTICES = 3_000_000  # 300 MB until they are written
 WINDOW = 1024  # cells
-TOLERANCE_CELLS = 0.3  # of simplified lines: less than half a cell, the uncertainty of where a height applies
+# Largest shift of a simplified line: less than half a cell, the uncertainty of where a height applies.
+TOLERANCE_CELLS = 0.3
 MIN_LOOP_CELLS = 12.0  # length of a closed line: shorter ones are noise of single cells
-SAME_PLACE_CELLS = 1e-6  # two windows round the same crossing differently
+MAX_JOIN_CELLS = 1e-6  # two windows round the same crossing differently
 
 Line = Float64[np.ndarray, "n 2"]
 
@@ -161,7 +162,7 @@ class _Chain:
     parts: deque[Line] = field(default_factory=deque)
 
 
-_Place = tuple[int, int, int]  # level, and where in steps of SAME_PLACE_CELLS
+_Place = tuple[int, int, int]  # level, and where in steps of MAX_JOIN_CELLS
 
 
 class _LineJoiner:
@@ -225,7 +226,7 @@ def _pop_chain(chains: dict[_Place, list[_Chain]], place: _Place) -> _Chain | No
 
 
 def _place(level: int, point: Float64[np.ndarray, " 2"]) -> _Place:
-    return level, round(float(point[0]) / SAME_PLACE_CELLS), round(float(point[1]) / SAME_PLACE_CELLS)
+    return level, round(float(point[0]) / MAX_JOIN_CELLS), round(float(point[1]) / MAX_JOIN_CELLS)
 
 
 def _concatenate(chain: _Chain) -> Line:
@@ -233,7 +234,7 @@ def _concatenate(chain: _Chain) -> Line:
 
 
 def _is_closed(line: Line) -> bool:
-    return bool(np.abs(line[0] - line[-1]).max() <= 2.0 * SAME_PLACE_CELLS)
+    return bool(np.abs(line[0] - line[-1]).max() <= 2.0 * MAX_JOIN_CELLS)
 
 
 def _is_noise(line: Line) -> bool:

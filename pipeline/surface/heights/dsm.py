@@ -22,7 +22,7 @@ from splatpipe.pipeline.surface.heights.heights import TILE, HeightInput, surfac
 from splatpipe.pipeline.surface.rasters.geotiff import CONFIDENCE, HEIGHTS, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, grid_sheets
+from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, divide_into_sheets
 from splatpipe.pipeline.surface.sheets.sheet_work import Arrays, SheetWork
 
 CACHE_BYTES = 512 << 20  # limit for depths in memory
@@ -72,16 +72,18 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
         MachineError: if the disk is full.
     """
     grid = make_grid(task.surface.frame, task.site.box, task.cell_m)
-    sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
-    making = SheetWork(sheets, partial(_is_seen, task.site), task.surface.area, TILE, work, report, "surface model")
+    grid_sheets = list(divide_into_sheets(grid, *height_range(task.site, grid)))
+    making = SheetWork(
+        grid_sheets, partial(_is_seen, task.site), task.surface.area, TILE, work, report, "surface model"
+    )
 
-    def heights(sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
-        sources = [sheet.sheet.transform_depths(source) for source in task.surface.depths]
-        capture = HeightInput(sources, sheet.sheet.lattice, sheet.sheet.relief, LruCache(CACHE_BYTES))
+    def heights(grid_sheet: GridSheet, tiles: Sequence[Tile]) -> Iterator[tuple[Tile, Arrays]]:
+        sources = [grid_sheet.plane.transform_depths(source) for source in task.surface.depths]
+        capture = HeightInput(sources, grid_sheet.plane.lattice, grid_sheet.plane.relief, LruCache(CACHE_BYTES))
         for part in surface_heights(capture, tiles, task.threads):
             sigma = np.nan_to_num(np.ceil(part.sigma.astype(np.float64) * MILLIMETRES))
             confidence = np.stack([part.photos, np.minimum(sigma, MAX_MILLIMETRES)], axis=-1).astype(np.uint16)
-            over = sheet.heights(part.tile, part.height).astype(np.float32)
+            over = grid_sheet.heights(part.tile, part.height).astype(np.float32)
             yield part.tile, {"height": over, "confidence": confidence}
 
     making.run(heights)
@@ -103,10 +105,10 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
     }
 
 
-def _is_seen(site: SiteExtent, sheet: GridSheet, tile: Tile) -> bool:
+def _is_seen(site: SiteExtent, grid_sheet: GridSheet, tile: Tile) -> bool:
     """Whether enough photos see any part of a tile."""
-    corners = sheet.sheet.lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
-    local = sheet.sheet.local_from_sheet(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
+    corners = grid_sheet.plane.lattice.centres(tile)[[0, 0, -1, -1], [0, -1, 0, -1]]
+    local = grid_sheet.plane.local_from_plane(np.concatenate([corners, np.zeros((4, 1))], axis=1))[:, :2]
     return site.sees(np.stack([local.min(axis=0), local.max(axis=0)]))
 
 

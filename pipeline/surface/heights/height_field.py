@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64
 
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 
-STEEPEST = 2.0  # rise over run between neighbouring cells; anything steeper is a step and not interpolated
+MAX_SLOPE = 2.0  # rise over run between neighbouring cells; anything steeper is a step and not interpolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class HeightField:
         corners = [self._cell(row + i, column + j) for i in (0, 1) for j in (0, 1)]
         low = np.minimum(np.minimum(corners[0], corners[1]), np.minimum(corners[2], corners[3]))
         high = np.maximum(np.maximum(corners[0], corners[1]), np.maximum(corners[2], corners[3]))
-        smooth = high - low <= 2.0 * STEEPEST * self.lattice.cell_m  # nan: not smooth
+        smooth = high - low <= 2.0 * MAX_SLOPE * self.lattice.cell_m  # nan: not smooth
         upper = corners[0] * (1.0 - x) + corners[1] * x
         lower = corners[2] * (1.0 - x) + corners[3] * x
         return np.where(smooth, upper * (1.0 - y) + lower * y, nearest)

@@ -13,17 +13,18 @@ from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.depths.point_visibility import PointVisibility, classify_points
 from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache, PosedDepthMap, photos_seeing
 from splatpipe.pipeline.surface.heights.holes import fill_holes
-from splatpipe.pipeline.surface.heights.votes import HALF, HeightVotes, Layer, needs_check
+from splatpipe.pipeline.surface.heights.votes import MIN_COVER_SHARE, HeightVotes, Layer, needs_check
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
 TILE = 256  # cells per side
 MIN_PHOTOS = 3  # photos that have to see a cell
-NEAR = 4  # cells: holes up to this size are filled from their surroundings,
-FAR = 16  # larger ones up to this if photos may see the filled surface,
+FILL_CELLS = 4  # cells: holes up to this size are filled from their surroundings,
+SEEN_FILL_CELLS = 16  # larger ones up to this if photos may see the filled surface,
 FAR_ON_WALLS = 28  # and still larger ones on walls, which are flat and textureless where depths are missing
-BEHIND = 8  # one photo that sees through a surface outweighs this many that see it: depths widen foreground objects
-FEW = 2  # photos that agree on a height are enough where a third one may see it
+# One photo that sees through a surface outweighs this many that see it: depths widen foreground objects.
+OUTWEIGHED_PHOTOS = 8
+MIN_AGREEING_PHOTOS = 2  # photos that agree on a height are enough where a third one may see it
 FILLED_SIGMA_CELLS = 1.0  # expected deviation of a filled cell, in cells
 MAX_VOTES = 5_000_000  # cells times photos at once: 250 MB while they are sorted
 MIN_CELLS = 1 << 12  # smaller tiles are not split: they would be mostly margin
@@ -70,12 +71,12 @@ class HeightInput:
     @property
     def far(self) -> int:
         """Size limit of the larger holes to fill, cells."""
-        return FAR_ON_WALLS if self.upright else FAR
+        return FAR_ON_WALLS if self.upright else SEEN_FILL_CELLS
 
     @property
     def margin(self) -> int:
         """Margin around a tile that filling its holes needs, cells."""
-        return NEAR + self.far + 1
+        return FILL_CELLS + self.far + 1
 
     def depths(self, number: int) -> PosedDepthMap:
         """A photo's depths, loaded if they are not cached."""
@@ -117,14 +118,14 @@ def tile_heights(capture: HeightInput, tile: Tile, most: int = MAX_VOTES) -> Hei
     numbers = [number for number, _ in seen]
     fit = votes.fit(_choose_surface(capture, wide, found, numbers))
     agreed = np.where(fit.photos >= MIN_PHOTOS, fit.height, np.nan)
-    few = np.flatnonzero((fit.photos == FEW) & np.isfinite(fit.height))
+    few = np.flatnonzero((fit.photos == MIN_AGREEING_PHOTOS) & np.isfinite(fit.height))
     may = _count_possible_views(capture, wide, few, fit.height[few], numbers) >= MIN_PHOTOS
     agreed[few[may]] = fit.height[few[may]]
     height, new = _fill_holes(capture, wide, agreed, numbers)
     shape = (wide.height, wide.width)
     sigma = np.where(new, FILLED_SIGMA_CELLS * capture.lattice.cell_m, fit.sigma).reshape(shape)
-    counted = np.where(np.isfinite(agreed), np.minimum(fit.photos, MAX_COUNT), 0)
-    photos, height = np.where(new, 1, counted).reshape(shape), height.reshape(shape)
+    photo_counts = np.where(np.isfinite(agreed), np.minimum(fit.photos, MAX_COUNT), 0)
+    photos, height = np.where(new, 1, photo_counts).reshape(shape), height.reshape(shape)
     inner = tuple(slice(capture.margin, capture.margin + side) for side in (tile.height, tile.width))
     known = np.isfinite(height)
     return Heights(
@@ -140,7 +141,7 @@ def _fill_holes(
 ) -> tuple[Float64[np.ndarray, " c"], Bool[np.ndarray, " c"]]:
     """Fill a tile's small holes, and larger ones where enough photos may see the result; also returns which are new."""
     shape, cell_m = (tile.height, tile.width), capture.lattice.cell_m
-    near, _ = fill_holes(height.reshape(shape), cell_m, NEAR, capture.upright)
+    near, _ = fill_holes(height.reshape(shape), cell_m, FILL_CELLS, capture.upright)
     far, new = fill_holes(near, cell_m, capture.far, capture.upright)
     result, candidates = far.ravel(), np.flatnonzero(new)
     seen = _count_possible_views(capture, tile, candidates, result[candidates], numbers) >= MIN_PHOTOS
@@ -200,7 +201,7 @@ def _choose_surface(
     heights = np.stack([layer.height[candidates] for layer in found])
     balance = _balance(capture, tile, candidates, heights, numbers)
     good = np.isfinite(heights) & (balance >= 0)
-    covering = good & (np.stack([layer.cover[candidates] for layer in found]) >= HALF)
+    covering = good & (np.stack([layer.cover[candidates] for layer in found]) >= MIN_COVER_SHARE)
     good = np.where(covering.any(axis=0), covering, good)
     highest = np.where(good.any(axis=0), np.argmax(good, axis=0), -1)
     start = found[0].height.copy()
@@ -215,8 +216,8 @@ def _balance(
     heights: Float64[np.ndarray, "l a"],
     numbers: Sequence[int],
 ) -> Int64[np.ndarray, "l a"]:
-    """Number of photos that see a surface, minus ``BEHIND`` times those that see through it."""
+    """Number of photos that see a surface, minus ``OUTWEIGHED_PHOTOS`` times those that see through it."""
     balance = np.zeros(heights.shape, np.int64)
     for layer, view in _views(capture, tile, candidates, heights, numbers):  # whole numbers add up in any order
-        balance[layer] += view.seen.astype(np.int64) - BEHIND * view.through.astype(np.int64)
+        balance[layer] += view.seen.astype(np.int64) - OUTWEIGHED_PHOTOS * view.through.astype(np.int64)
     return balance

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float64
 
-SIDES = 3  # of the four directions, in which there has to be a height within reach
+MIN_DIRECTIONS = 3  # fewest of the four directions with a height within reach
 STEP_CELLS = 3.0  # heights this many cells above the lowest one nearby are another surface: a hole at a wall is ground
 
 
@@ -37,7 +37,7 @@ def fill_holes(
         nearness.append(1.0 / distance)
     value, weight = np.stack(values), np.stack(nearness)
     known = weight > 0.0
-    enough = known.sum(axis=0) >= SIDES
+    enough = known.sum(axis=0) >= MIN_DIRECTIONS
     like = (
         _best_supported(value, weight, STEP_CELLS * cell_m)
         if upright

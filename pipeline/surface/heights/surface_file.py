@@ -17,7 +17,7 @@ from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
 WINDOW = 1024  # cells a side that are read at a time
-SIGMA_BAND = 2  # of `dsm_confidence.tif`, millimetres; 0 where there is none
+SIGMA_BAND = 2  # band of `dsm_confidence.tif` with deviations in millimetres; 0 where there is none
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from splatpipe.pipeline.surface.depths.sources import HeightRange, PhotoWindow, 
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
-HALF = 0.5  # of a cell that a surface has to cover if there is another one below: otherwise edges would grow outwards
+MIN_COVER_SHARE = 0.5  # share of a cell that a surface covers above another one: otherwise edges would grow
 LAYERS = 3  # surfaces above each other in a cell that are considered
 
 

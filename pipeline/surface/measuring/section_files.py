@@ -31,7 +31,7 @@ from splatpipe.pipeline.surface.measuring.sections import Section
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, unit_name
 
 UNIT_KEYS = {"metre": "m", "foot": "ft", "US survey foot": "us_ft"}
-DIGITS = 4  # of lengths and coordinates: a tenth of a millimetre
+DIGITS = 4  # decimals of lengths and coordinates in metres: a tenth of a millimetre
 GRID_STEPS_M = tuple(base * 10.0**power for power in range(-1, 4) for base in (1.0, 2.0, 5.0))
 GRID_MM = 20.0  # between a section's grid lines on paper, at least
 LABEL_MM = 2.0  # from the grid to its lengths and heights

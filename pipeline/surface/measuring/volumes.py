@@ -33,10 +33,10 @@ SHARED_AROUND = 4.0 * math.pi * SHARED_CELLS**2  # and over an area
 RIM_CELLS = 1.0  # spacing of samples on the rim, in cells
 MAX_RIM = 1_000_000  # samples: 20 km at 2 cm; a longer rim means a wrong coordinate
 MIN_RIM = 12  # samples with heights needed to fit a plane
-MIN_RIM_SHARE = 0.5  # of the rim that needs heights: with less, the base is unreliable
+MIN_RIM_SHARE = 0.5  # least share of the rim that has heights: with less, the base is unreliable
 MEDIAN_OF = 5  # neighbouring samples in the median filter: a single cell may be in a hole
 DEFAULT_SIGMA_CELLS = 0.5  # assumed deviation where none is stated, in cells
-ROUNDS, HUBER = 5, 1.5  # of the plane's robust fit; residuals beyond this many deviations are weighted down
+ROUNDS, HUBER = 5, 1.5  # iterations of the plane's robust fit, and deviations beyond which residuals are weighted down
 
 Kind = Literal["rim", "lowest", "stated"]
 

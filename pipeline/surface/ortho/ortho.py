@@ -28,11 +28,11 @@ from splatpipe.pipeline.surface.ortho.orthophoto import EXTENDED_CELLS, TILE, Or
 from splatpipe.pipeline.surface.rasters.geotiff import COLOURS, gdal, open_raster, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, grid_sheets
+from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, divide_into_sheets
 from splatpipe.pipeline.surface.sheets.sheet_work import Arrays, SheetWork
 
 PIXEL_BYTES = 1 << 30  # limit for decoded photos in memory; beyond it, all are kept on disk
-AROUND = 3  # margin in cells of the surface model around the pixels, for interpolation
+HEIGHT_MARGIN_CELLS = 3  # margin in cells of the surface model around the pixels, for interpolation
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +74,9 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
     """
     grid = make_grid(task.surface.frame, task.site.box, task.gsd_m)
     heights = make_grid(task.surface.frame, task.site.box, task.dsm_cell_m)
-    sheets = list(grid_sheets(grid, *height_range(task.site, grid)))
+    grid_sheets = list(divide_into_sheets(grid, *height_range(task.site, grid)))
     known = partial(_has_heights, known_cells(task.dsm), heights)
-    making = SheetWork(sheets, known, task.surface.area, TILE, work, report, "orthophoto")
+    making = SheetWork(grid_sheets, known, task.surface.area, TILE, work, report, "orthophoto")
     work.mkdir(exist_ok=True)
     with pixels_on_disk(task.surface.photos, work, PIXEL_BYTES) as photos:
         levels = exposure_levels(photos, _places(task.dsm, heights), 2.0 * grid.cell_m, task.threads)
@@ -107,12 +107,12 @@ class _Pictures:
 
 
 def _colours(
-    task: OrthoTask, heights: Grid, pictures: _Pictures, sheet: GridSheet, tiles: Sequence[Tile]
+    task: OrthoTask, heights: Grid, pictures: _Pictures, grid_sheet: GridSheet, tiles: Sequence[Tile]
 ) -> Iterator[tuple[Tile, Arrays]]:
     """The colours of a sheet's tiles."""
-    plane = sheet.sheet
+    plane = grid_sheet.plane
     photos = [plane.transform_photo(photo) for photo in pictures.sources]
-    surface = _surface(sheet, task.dsm, heights)
+    surface = _surface(grid_sheet, task.dsm, heights)
     album = OrthoInput(
         photos, surface, plane.lattice, plane.relief, pictures.levels, pictures.pixels, LruCache(CACHE_BYTES)
     )
@@ -121,10 +121,10 @@ def _colours(
         yield part.tile, {"colour": np.concatenate([part.colour, alpha[..., None]], axis=-1)}
 
 
-def _has_heights(known: KnownCells, heights: Grid, sheet: GridSheet, tile: Tile) -> bool:
+def _has_heights(known: KnownCells, heights: Grid, grid_sheet: GridSheet, tile: Tile) -> bool:
     """Whether any pixels of a sheet's tile may have a height."""
-    part = Tile(sheet.part.row + tile.row, sheet.part.column + tile.column, tile.height, tile.width)
-    return known.any_in(_cells_under(sheet.grid, part, heights, AROUND * heights.cell))
+    part = Tile(grid_sheet.part.row + tile.row, grid_sheet.part.column + tile.column, tile.height, tile.width)
+    return known.any_in(_cells_under(grid_sheet.grid, part, heights, HEIGHT_MARGIN_CELLS * heights.cell))
 
 
 def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
@@ -143,15 +143,17 @@ def _cells_under(grid: Grid, part: Tile, heights: Grid, margin: float) -> Tile:
     return Tile(top, left, bottom + 1 - top, right + 1 - left)
 
 
-def _surface(sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
+def _surface(grid_sheet: GridSheet, dsm: Path, heights: Grid) -> HeightField:
     """The heights under a sheet's pixels, relative to the sheet."""
-    margin = (MARGIN + EXTENDED_CELLS) * sheet.grid.cell + AROUND * heights.cell
-    part = _cells_under(sheet.grid, sheet.part, heights, margin)
+    margin = (MARGIN + EXTENDED_CELLS) * grid_sheet.grid.cell + HEIGHT_MARGIN_CELLS * heights.cell
+    part = _cells_under(grid_sheet.grid, grid_sheet.part, heights, margin)
     rows = np.clip([part.row, part.row + part.height], 0, heights.height)
     columns = np.clip([part.column, part.column + part.width], 0, heights.width)
     part = Tile(int(rows[0]), int(columns[0]), int(max(rows[1] - rows[0], 1)), int(max(columns[1] - columns[0], 1)))
     found = _read(dsm, part)
-    return HeightField(sheet.lattice_of(heights, part), sheet.heights_over(heights, part, found).astype(np.float32))
+    return HeightField(
+        grid_sheet.lattice_of(heights, part), grid_sheet.heights_over(heights, part, found).astype(np.float32)
+    )
 
 
 def _read(dsm: Path, part: Tile) -> Float64[np.ndarray, "h w"]:

@@ -24,13 +24,13 @@ from splatpipe.pipeline.survey.crs.world import World
 
 TILE = 512  # cells: a block of the files
 DIGITS = 3  # significant digits of the cell size: 0.028 rather than 0.027963; at most 0.5 % off
-LIKE_GROUND = 0.005  # a grid metre this close to a ground metre counts as one, so that 2 cm stay 2 cm in UTM
+GROUND_SCALE_TOLERANCE = 0.005  # a grid metre this close to a ground metre counts as one, so that 2 cm stay 2 cm in UTM
 MIN_CELL_M, MAX_CELL_M = 1e-4, 1e3
 MAX_CELLS_PER_SIDE = 1_000_000
 MAX_CELLS = 20_000_000_000  # 8 km² at 2 cm, a file of 80 GB of heights before compression
 ROUNDING = 1e-6  # cells: an extent that ends on a grid line gets no cell beyond it
 EDGE_STEPS = 9  # samples along each side of the scene's box
-HEIGHT_MARGIN_M = 10.0  # of the lattice beyond the scene: heights are interpolated linearly in it
+HEIGHT_MARGIN_M = 10.0  # by which the lattice exceeds the scene: heights are interpolated linearly in it
 
 
 Exact = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
@@ -141,7 +141,7 @@ def cell_size(crs: MapCrs, gsd_m: float) -> float:
         gsd_m: Cell size on the ground, metres.
     """
     scale = 1.0 if crs.world is None else _ground_scale(crs.world)
-    stretched = gsd_m if abs(scale - 1.0) < LIKE_GROUND else gsd_m * scale
+    stretched = gsd_m if abs(scale - 1.0) < GROUND_SCALE_TOLERANCE else gsd_m * scale
     return float(f"{stretched / crs.unit_m:.{DIGITS}g}")
 
 

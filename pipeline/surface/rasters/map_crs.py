@@ -41,7 +41,7 @@ LOCAL_WKT = (
     'ENGCRS["Local metres, z up, arbitrary place and heading",EDATUM["The reconstruction"],CS[Cartesian,2],'
     'AXIS["easting (E)",east],AXIS["northing (N)",north],LENGTHUNIT["metre",1]]'
 )
-SAME_UNIT = 1e-9  # relative: the US survey foot and the foot differ by 2e-6
+UNIT_TOLERANCE = 1e-9  # relative: the US survey foot and the foot differ by 2e-6
 UNIT_NAMES = {1.0: "metre", 0.3048: "foot", 1200.0 / 3937.0: "US survey foot"}
 
 
@@ -108,13 +108,13 @@ def open_map(frame: Frame) -> MapCrs:
 def unit_name(unit_m: float) -> str:
     """Name of a unit of length for users."""
     for known_m, name in UNIT_NAMES.items():
-        if math.isclose(unit_m, known_m, rel_tol=SAME_UNIT):
+        if math.isclose(unit_m, known_m, rel_tol=UNIT_TOLERANCE):
             return name
     return f"{unit_m:.10g} m"
 
 
 def _plane(world: World) -> World:
-    """The same world in a projected CRS whose first axis does not point west."""
+    """This world in a projected CRS whose first axis does not point west."""
     if usable_for_maps(world.crs):
         return world
     latitude, longitude = world.origin.latitude, world.origin.longitude
@@ -153,4 +153,4 @@ def _vertical(heights: str, unit_m: float) -> pyproj.CRS | None:
 def _is_in(vertical: pyproj.CRS, unit_m: float) -> bool:
     """Whether a vertical CRS has upward heights in a unit."""
     axis = vertical.axis_info[0]
-    return axis.direction == "up" and math.isclose(axis.unit_conversion_factor, unit_m, rel_tol=SAME_UNIT)
+    return axis.direction == "up" and math.isclose(axis.unit_conversion_factor, unit_m, rel_tol=UNIT_TOLERANCE)

@@ -15,7 +15,7 @@ from splatpipe.pipeline.surface.rasters.geotiff import gdal, open_raster
 
 EMPTY = 255  # grey of what has no data
 LIGHT_FROM = np.array([-0.5, 0.5, np.sqrt(0.5)])  # east, north, up: from the north-west at 45°, as on maps
-DARKEST, LIGHTEST = 0.25, 1.4  # brightness of slopes away from and towards the light; level ground has 1
+MIN_BRIGHTNESS, MAX_BRIGHTNESS = 0.25, 1.4  # brightness of slopes away from and towards the light; level ground has 1
 SPREAD = 0.01  # share of the heights at either end that get the end's colour
 
 
@@ -73,7 +73,7 @@ def _light(height: Float64[np.ndarray, "h w"], step: float) -> Float64[np.ndarra
     down, right = np.gradient(height, step)
     normal = np.stack([-right, down, np.ones_like(height)], axis=-1)
     lit = (normal @ LIGHT_FROM) / np.linalg.norm(normal, axis=-1) / LIGHT_FROM[2]
-    return np.asarray(np.clip(np.nan_to_num(lit, nan=1.0), DARKEST, LIGHTEST))
+    return np.asarray(np.clip(np.nan_to_num(lit, nan=1.0), MIN_BRIGHTNESS, MAX_BRIGHTNESS))
 
 
 def _shape(raster: rasterio.DatasetReader, side: int) -> tuple[int, int]:

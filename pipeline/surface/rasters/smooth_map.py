@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-SPACING_M = 50.0  # of nodes: what is between is off by 0.05 mm a direction
+SPACING_M = 50.0  # between nodes: interpolation is off by 0.05 mm a direction
 MAX_STEPS = 400  # along a side: beyond 20 km nodes are further apart, and what is between them is off by more
 CHUNK = 1 << 16  # points at a time: their products stay in the cache
 

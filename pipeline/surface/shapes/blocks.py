@@ -18,7 +18,7 @@ BAND = 3.0  # truncation distance on either side of the surface, in voxels
 MIN_PHOTOS = 2  # photos that have to see a surface in a block: each of their depths is already confirmed by others
 PIXEL_STEP = 3  # one pixel in this many is used per axis: blocks are wider
 MIN_GROWTH = 1.05  # factor by which voxels that were too small grow
-BITS = 21  # of a block's number along an axis: two million
+BITS = 21  # size of a block's number along an axis: two million blocks
 
 Keys = Int64[np.ndarray, " n"]
 Box = Float64[np.ndarray, "2 3"]  # least and largest east, north, up, metres: the part of the world that counts

@@ -26,12 +26,12 @@ from splatpipe.pipeline.surface.depths.sources import HeightRange
 from splatpipe.pipeline.surface.rasters.lattice import Lattice
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
-FINER = 0.9  # of a point's footprint: a photo with a smaller one takes over the point; otherwise both may keep it
+MAX_FOOTPRINT_SHARE = 0.9  # a photo with less of a point's footprint takes it over; else both may keep it
 MIN_PHOTOS = 3  # photos that have to see a point, including its own
 REACH = 2.5  # standard deviations from the mean within which a photo counts (Tukey's biweight; Beaton and Tukey 1974)
 SIGMA_PX = 0.7  # standard deviation of a depth, in pixel footprints on the surface
-ROUNDS = 3  # of the robust mean
-COMPACT_SHARE = 0.3  # of discarded points, at which the arrays are compacted
+ROUNDS = 3  # iterations of the robust mean
+COMPACT_SHARE = 0.3  # share of discarded points at which the arrays are compacted
 BATCH = 1 << 14  # points at a time: takes 16 bytes per point and photo
 MAX_COUNT = np.iinfo(np.uint8).max
 
@@ -126,7 +126,7 @@ def _drop_coarser(points: DepthPoints, others: Sequence[DepthPart]) -> DepthPoin
         if lost.mean() > COMPACT_SHARE:
             points, lost = points.select(~lost), np.zeros(int((~lost).sum()), np.bool_)
         view = view_pieces(other.camera, points.pieces)
-        candidates = np.flatnonzero((view.footprint < FINER * points.footprint) & ~lost)
+        candidates = np.flatnonzero((view.footprint < MAX_FOOTPRINT_SHARE * points.footprint) & ~lost)
         visibility = view.classify(other, candidates)
         lost[candidates] = visibility.seen & ~visibility.mixed
     return points.select(~lost)

@@ -25,7 +25,7 @@ from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
 
-SCALE = 0.001  # of coordinates: a millimetre, or a thousandth of a foot
+SCALE = 0.001  # step of coordinates: a millimetre, or a thousandth of a foot
 NORMAL_STEPS = 127.0
 NORMAL_FIELDS = ("NormalX", "NormalY", "NormalZ")
 CONFIDENCE_FIELD = "Confidence"
@@ -133,7 +133,7 @@ def _header(frame: CloudFrame, taken_on: date) -> laspy.LasHeader:
 
 
 def _pieces(chunks: Iterable[CloudChunk]) -> Iterator[CloudChunk]:
-    """The same points, at most ``ROWS`` at a time."""
+    """These points, at most ``ROWS`` at a time."""
     for chunk in chunks:
         for start in range(0, len(chunk.positions), ROWS):
             rows = slice(start, start + ROWS)

@@ -17,10 +17,11 @@ from splatpipe.pipeline.surface.depths.photo_set import PhotoSet, SurfacePieces,
 from splatpipe.pipeline.surface.depths.point_visibility import project_points
 from splatpipe.pipeline.surface.depths.sources import LruCache, PosedDepthMap
 
-COARSE = 4  # a photo's weight falls with this power of its footprint: with pixels twice as large, it is a sixteenth
-MIXED = 0.01  # weight where an adjacent pixel of the depths shows a nearer surface: its colour may be mixed in
+# A photo's weight falls with this power of its footprint: with pixels twice as large, it is a sixteenth.
+FOOTPRINT_POWER = 4
+EDGE_WEIGHT = 0.01  # weight where an adjacent pixel of the depths shows a nearer surface: its colour may be mixed in
 BATCH = 1 << 17  # points at a time
-CACHE_BYTES = 300 << 20  # of depths in memory
+CACHE_BYTES = 300 << 20  # depths in memory
 
 
 def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> PhotoSet:
@@ -118,6 +119,6 @@ def _visible_rows(
     facing = np.flatnonzero(np.isfinite(view.footprint))
     visibility = view.classify(found, facing)
     coarse = np.maximum(view.footprint[facing] / cell_m, 0.1)  # finer ones are no better, and powers stay finite
-    weight = np.where(visibility.seen, np.where(visibility.mixed, MIXED, 1.0), 0.0) / coarse**COARSE
+    weight = np.where(visibility.seen, np.where(visibility.mixed, EDGE_WEIGHT, 1.0), 0.0) / coarse**FOOTPRINT_POWER
     kept = weight > 0.0
     return rows[facing[kept]], weight[kept].astype(np.float32)

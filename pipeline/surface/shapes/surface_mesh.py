@@ -23,9 +23,10 @@ from splatpipe.pipeline.surface.shapes.point_colours import photo_set, point_col
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, remove_small_components
 from splatpipe.pipeline.surface.shapes.tsdf import open3d, tsdf_mesh
 
-MAX_BLOCKS = 55_000  # of voxels: 0.25 GB, and 2.5 million triangles before decimation; beyond it voxels are larger
+# Blocks of voxels: 0.25 GB, and 2.5 million triangles before decimation; beyond it voxels are larger.
+MAX_BLOCKS = 55_000
 CRUMB_VOXELS = 200.0  # area in voxel faces: smaller pieces are floating noise or not worth keeping
-GREY = 128  # of a mesh that no photo shows
+GREY = 128  # colour value for a mesh that no photo shows
 
 
 @dataclass(frozen=True, eq=False)

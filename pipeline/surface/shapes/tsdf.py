@@ -24,7 +24,7 @@ from splatpipe.pipeline.surface.shapes.blocks import BAND, MIN_PHOTOS, SIDE, Blo
 from splatpipe.pipeline.surface.shapes.triangles import TriangleMesh, in_order
 
 FARTHEST_M = 1e4  # open3d requires a depth limit
-WIDER = 1.01  # times a block's half diagonal: includes blocks that touch the view's sides, despite rounding
+RADIUS_FACTOR = 1.01  # times a block's half diagonal: includes blocks that touch the view's sides, despite rounding
 
 
 def open3d() -> Any:
@@ -103,7 +103,7 @@ def _pose(camera: Camera, blocks: Blocks) -> np.ndarray:
 
 def _in_view(camera: Camera, blocks: Blocks) -> Bool[np.ndarray, " n"]:
     """Blocks that may be partly inside a camera's view."""
-    reach = WIDER * SIDE * blocks.voxel_m * np.sqrt(3.0) / 2.0
+    reach = RADIUS_FACTOR * SIDE * blocks.voxel_m * np.sqrt(3.0) / 2.0
     pose = camera.cam_from_world
     x, y, depth = pose[:3, :3] @ blocks.centres() + pose[:3, 3:]
     inside = depth > -reach

@@ -28,7 +28,7 @@ class RasterPlane:
     """A plane with cells, and the height range to consider over it.
 
     Attributes:
-        from_local: Rigid, from local metres to the sheet's: along the rows, against the columns, towards the viewer.
+        from_local: Rigid, from local metres to the plane's: along the rows, against the columns, towards the viewer.
         lattice: Its cells.
         relief: Range of heights over the plane.
     """
@@ -37,23 +37,23 @@ class RasterPlane:
     lattice: Lattice
     relief: HeightRange
 
-    def sheet_from_local(self, local: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """East, north, up (metres) in the sheet's frame."""
+    def plane_from_local(self, local: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
+        """East, north, up (metres) in the plane's frame."""
         return np.asarray(local @ self.from_local[:3, :3].T + self.from_local[:3, 3])
 
-    def local_from_sheet(self, places: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """The inverse of ``sheet_from_local``."""
+    def local_from_plane(self, places: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
+        """The inverse of ``plane_from_local``."""
         return np.asarray((places - self.from_local[:3, 3]) @ self.from_local[:3, :3])
 
     def transform_camera(self, camera: Camera) -> Camera:
-        """Transform a camera from the local to the sheet's frame."""
+        """Transform a camera from the local to the plane's frame."""
         back = np.eye(4)
         back[:3, :3] = self.from_local[:3, :3].T
         back[:3, 3] = -back[:3, :3] @ self.from_local[:3, 3]
         return replace(camera, cam_from_world=camera.cam_from_world @ back)
 
     def transform_depths(self, source: DepthSource) -> DepthSource:
-        """Transform a photo's depths from the local to the sheet's frame."""
+        """Transform a photo's depths from the local to the plane's frame."""
         camera = self.transform_camera(source.camera)
 
         def load() -> PosedDepthMap:
@@ -63,7 +63,7 @@ class RasterPlane:
         return DepthSource(camera, load)
 
     def transform_photo(self, photo: PhotoSource) -> PhotoSource:
-        """Transform a photo with its depths from the local to the sheet's frame."""
+        """Transform a photo with its depths from the local to the plane's frame."""
         depths = None if photo.depths is None else self.transform_depths(photo.depths)
         return replace(photo, camera=self.transform_camera(photo.camera), depths=depths)
 
@@ -75,12 +75,12 @@ class GridSheet:
     Attributes:
         grid: The raster's grid.
         part: The grid's cells that the sheet's lattice has.
-        sheet: The sheet.
+        plane: The plane of its cells.
     """
 
     grid: Grid
     part: Tile
-    sheet: RasterPlane
+    plane: RasterPlane
 
     def heights(
         self, tile: Tile, over: Float64[np.ndarray, "h w"] | Float32[np.ndarray, "h w"]
@@ -91,29 +91,29 @@ class GridSheet:
             tile: Tile of the sheet's lattice.
             over: Heights of its cells over the sheet, metres; NaN where there are none.
         """
-        places = np.concatenate([self.sheet.lattice.centres(tile), over.astype(np.float64)[..., None]], axis=-1)
-        cells = self.grid.cells_from_local(self.sheet.local_from_sheet(places.reshape(-1, 3)))
+        places = np.concatenate([self.plane.lattice.centres(tile), over.astype(np.float64)[..., None]], axis=-1)
+        cells = self.grid.cells_from_local(self.plane.local_from_plane(places.reshape(-1, 3)))
         return np.asarray(cells[:, 2].reshape(over.shape))
 
     def lattice_of(self, other: Grid, part: Tile) -> Lattice:
         """The lattice of another grid's cells on this sheet; the grid has the same CRS."""
-        scale = self.sheet.lattice.cell_m / self.grid.cell  # metres of the sheet in a unit of the CRS
+        scale = self.plane.lattice.cell_m / self.grid.cell  # metres of the sheet in a unit of the CRS
         west, north = (other.left + part.column) * other.cell, (other.top - part.row) * other.cell
         left, top = (
             (self.grid.left + self.part.column) * self.grid.cell,
             (self.grid.top - self.part.row) * self.grid.cell,
         )
-        lattice = self.sheet.lattice
+        lattice = self.plane.lattice
         east_m, north_m = lattice.east_m + (west - left) * scale, lattice.north_m + (north - top) * scale
         return Lattice(east_m, north_m, other.cell * scale, part.width, part.height)
 
     def heights_over(self, other: Grid, part: Tile, heights: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
         """Convert heights of another grid's cells in the CRS's unit to metres over this sheet."""
         local = other.centres_in_local(part, heights)
-        return np.asarray(self.sheet.sheet_from_local(local)[..., 2])
+        return np.asarray(self.plane.plane_from_local(local)[..., 2])
 
 
-def grid_sheets(grid: Grid, low: float, high: float, side: int = SIDE) -> Iterator[GridSheet]:
+def divide_into_sheets(grid: Grid, low: float, high: float, side: int = SIDE) -> Iterator[GridSheet]:
     """Divide a grid into sheets, row by row.
 
     Args:
@@ -123,10 +123,10 @@ def grid_sheets(grid: Grid, low: float, high: float, side: int = SIDE) -> Iterat
         side: Cells per side of a sheet.
     """
     for part in tiled(grid.height, grid.width, side):
-        yield GridSheet(grid, part, _sheet(grid, part, low, high))
+        yield GridSheet(grid, part, _level_plane(grid, part, low, high))
 
 
-def _sheet(grid: Grid, part: Tile, low: float, high: float) -> RasterPlane:
+def _level_plane(grid: Grid, part: Tile, low: float, high: float) -> RasterPlane:
     middle, unit_m = (low + high) / 2.0, grid.crs.height_unit_m
     column, row = part.column + part.width / 2.0, part.row + part.height / 2.0
     steps = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])

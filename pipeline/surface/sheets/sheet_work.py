@@ -23,7 +23,7 @@ class SheetWork:
     """Sheets to compute.
 
     Attributes:
-        sheets: All sheets of a grid.
+        grid_sheets: All sheets of a grid.
         wanted: Tells whether a tile of a sheet may have any content.
         area: Cells outside of it stay empty; None for no limit.
         tile: Cells per side of a tile.
@@ -32,7 +32,7 @@ class SheetWork:
         what: Name of the product, for progress.
     """
 
-    sheets: Sequence[GridSheet]
+    grid_sheets: Sequence[GridSheet]
     wanted: Callable[[GridSheet, Tile], bool]
     area: PlanArea | None
     tile: int
@@ -49,15 +49,16 @@ class SheetWork:
         """
         self.folder.mkdir(exist_ok=True)
         wanted = [
-            [tile for tile in sheet.sheet.lattice.tiles(self.tile) if self.wanted(sheet, tile)] for sheet in self.sheets
+            [tile for tile in grid_sheet.plane.lattice.tiles(self.tile) if self.wanted(grid_sheet, tile)]
+            for grid_sheet in self.grid_sheets
         ]
         done, total = 0, sum(len(tiles) for tiles in wanted)
-        for number, (sheet, tiles) in enumerate(zip(self.sheets, wanted, strict=True)):
+        for number, (grid_sheet, tiles) in enumerate(zip(self.grid_sheets, wanted, strict=True)):
             path = self._path(number)
             if tiles and not path.is_file():
                 whole: Arrays = {}
-                for tile, arrays in make(sheet, tiles):
-                    self._take(whole, sheet, tile, arrays)
+                for tile, arrays in make(grid_sheet, tiles):
+                    self._take(whole, grid_sheet, tile, arrays)
                     done += 1
                     self.report.progress(done, total, self.what, "tiles")
                 save_arrays(path, **whole)
@@ -67,27 +68,29 @@ class SheetWork:
 
     def finished(self) -> Iterator[tuple[Tile, Arrays]]:
         """The non-empty sheets, with the part of the grid that each covers."""
-        for number, sheet in enumerate(self.sheets):
+        for number, grid_sheet in enumerate(self.grid_sheets):
             path = self._path(number)
             if path.is_file():
                 with open_archive(path) as kept:
-                    yield sheet.part, dict(kept)
+                    yield grid_sheet.part, dict(kept)
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{number:06d}.npz"
 
-    def _take(self, whole: Arrays, sheet: GridSheet, tile: Tile, arrays: Arrays) -> None:
-        outside = None if self.area is None else ~self._inside(self.area, sheet, tile)
+    def _take(self, whole: Arrays, grid_sheet: GridSheet, tile: Tile, arrays: Arrays) -> None:
+        outside = None if self.area is None else ~self._inside(self.area, grid_sheet, tile)
         for name, values in arrays.items():
             empty = np.nan if np.issubdtype(values.dtype, np.floating) else 0
             if name not in whole:
-                whole[name] = np.full((sheet.part.height, sheet.part.width, *values.shape[2:]), empty, values.dtype)
+                whole[name] = np.full(
+                    (grid_sheet.part.height, grid_sheet.part.width, *values.shape[2:]), empty, values.dtype
+                )
             if outside is not None:
                 values[outside] = empty
             whole[name][tile.row : tile.row + tile.height, tile.column : tile.column + tile.width] = values
 
     @staticmethod
-    def _inside(area: PlanArea, sheet: GridSheet, tile: Tile) -> np.ndarray:
-        centres = sheet.sheet.lattice.centres(tile)
+    def _inside(area: PlanArea, grid_sheet: GridSheet, tile: Tile) -> np.ndarray:
+        centres = grid_sheet.plane.lattice.centres(tile)
         places = np.concatenate([centres, np.zeros((*centres.shape[:2], 1))], axis=-1)
-        return area.contains(sheet.sheet.local_from_sheet(places.reshape(-1, 3))).reshape(tile.height, tile.width)
+        return area.contains(grid_sheet.plane.local_from_plane(places.reshape(-1, 3))).reshape(tile.height, tile.width)

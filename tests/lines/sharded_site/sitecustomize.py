@@ -11,7 +11,7 @@ from splatpipe.pipeline.app.preflight import start  # noqa: E402
 from splatpipe.pipeline.engine import config  # noqa: E402
 
 config.load_preset = lambda name: {}
-start.require_memory = lambda *_, **__: None  # of a training, which this pipeline does not have
+start.require_memory = lambda *_, **__: None  # this pipeline has no training, whose memory could be checked
 start.memory_limit = lambda config, device: 0
 start.forecast_text = lambda request: ""
 start.shortage_text = lambda request, until: ""

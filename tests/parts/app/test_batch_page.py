@@ -72,8 +72,8 @@ def test_a_card_shows_a_photo_until_there_is_a_render(demo_run: Path, tmp_path: 
     render = capture_picture(out, capture_path(), kept)
     assert render is not None
     views = {path.name: path for path in demo_run.glob("stages/evaluate-*/views/*.render.png")}
-    with Image.open(render) as shown:
-        small = shown.convert("RGB")
+    with Image.open(render) as image:
+        small = image.convert("RGB")
     off = {name: difference(small, path) for name, path in views.items()}
     assert min(off.values()) < 6.0  # JPEG's
     stamp = render.stat().st_mtime_ns

@@ -23,7 +23,7 @@ from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.commands.console import show_bad_cameras
 from splatpipe.pipeline.app.report import is_current, make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
-from splatpipe.pipeline.app.report.charts.pictures import CHIP_SIDE, MAX_CHIPS, chosen_views, cut_chips
+from splatpipe.pipeline.app.report.charts.pictures import CROP_SIDE_PX, MAX_CROPS, chosen_views, cut_crops
 from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
@@ -51,14 +51,14 @@ def test_its_ids_are_unique(finished: Path) -> None:
 def test_a_cut_out_shows_the_photo_at_the_mark(finished: Path) -> None:
     inputs = read_report_inputs(finished)
     points = inputs.read("georef.control")["points"]
-    chips = cut_chips(points, inputs.part("ingest.photos"), inputs.photos_dir)
+    crops = cut_crops(points, inputs.part("ingest.photos"), inputs.photos_dir)
     seen = points[0]["observations"][0]
-    chip = chips[0, 0]
-    code = str(chip.picture).split(",")[1]
+    crop = crops[0, 0]
+    code = str(crop.picture).split(",")[1]
     cut = Image.open(io.BytesIO(base64.b64decode(code))).convert("RGB")
-    left, top = (math.floor(value - CHIP_SIDE / 2) for value in seen["pixel"])
+    left, top = (math.floor(value - CROP_SIDE_PX / 2) for value in seen["pixel"])
     with Image.open(capture_path() / seen["photo"]) as photo:
-        true = photo.convert("RGB").crop((left, top, left + CHIP_SIDE, top + CHIP_SIDE))
+        true = photo.convert("RGB").crop((left, top, left + CROP_SIDE_PX, top + CROP_SIDE_PX))
     differences = [abs(a - b) for a, b in zip(cut.tobytes(), true.tobytes(), strict=True)]
     assert sum(differences) / len(differences) < 6.0  # JPEG's
 
@@ -101,7 +101,7 @@ def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_
 )
 def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, part: str) -> None:
     path = read_report_inputs(copy_of_run).part(part)
-    write_apart(path, "[" + " " * (path.stat().st_size - 2) + "]")  # of the same length, with other content
+    write_apart(path, "[" + " " * (path.stat().st_size - 2) + "]")  # other content of unchanged length
     page = report_page(read_report_inputs(copy_of_run), drawn=False)
     assert page.count("This part could not be read") == 1
     assert "Processing</h2>" in page
@@ -255,9 +255,9 @@ def test_hundreds_of_photos_keep_the_report_small() -> None:
     assert len(chosen_views(views)) == 12 and chosen_views(views)[-1] is views[-1]
     seen = [{"photo": f"{i}.jpg", "pixel": [10.0, 10.0], "residual_px": [i / 100.0, 0.0]} for i in range(400)]
     points = [{"observations": seen}, {"observations": seen}, {"observations": seen[:3]}]
-    chips = cut_chips(points, None, None)
-    assert len(chips) == MAX_CHIPS
-    assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(chips) and (0, 0) not in chips
+    crops = cut_crops(points, None, None)
+    assert len(crops) == MAX_CROPS
+    assert {(0, 399), (1, 399), (2, 0), (2, 1), (2, 2)} <= set(crops) and (0, 0) not in crops
 
 
 def test_no_folder_outside_out_is_named(copy_of_run: Path) -> None:

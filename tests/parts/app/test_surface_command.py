@@ -128,7 +128,8 @@ def test_a_run_without_scale_is_refused_at_once_unless_it_is_georeferenced_again
     for path in (out / "stages").glob("georef-*/frame.json"):
         text = path.read_text()
         placed = {**json.loads(text), "kind": "arbitrary", "origin": None}
-        write_apart(path, json.dumps(placed).ljust(len(text)))  # of its size, or the artifact would count as damaged
+        # Padded to its former size, or the artifact would count as damaged.
+        write_apart(path, json.dumps(placed).ljust(len(text)))
     check_possible(demo_run, options_for("ortho", None, None))
     check_possible(out, options_for("ortho", None, None), {"georef": {"max_position_error_m": 5.0}})
     with pytest.raises(SplatpipeError, match="no metric scale"):

@@ -280,12 +280,12 @@ print(connection.recv(99))
 
 def test_the_key_of_the_opened_browser_counts_for_this_user_only(home: Path, tmp_path: Path) -> None:
     """The browser's command line, where it is, can be read by all users."""
-    told = tmp_path / "address"
+    address_file = tmp_path / "address"
     browser = tmp_path / "browser"
-    browser.write_text(f'#!/bin/sh\necho "$1" > {told}.new && mv {told}.new {told}\n')
+    browser.write_text(f'#!/bin/sh\necho "$1" > {address_file}.new && mv {address_file}.new {address_file}\n')
     browser.chmod(0o755)
     with serving(home / "out", "--browser", environment={"BROWSER": str(browser)}) as server:
-        address = wait_until(lambda: told.is_file() and told.read_text().strip(), "the browser")
+        address = wait_until(lambda: address_file.is_file() and address_file.read_text().strip(), "the browser")
         target = address.removeprefix(server.address)
         assert server.key not in address and "?key=" in target
         assert "set-cookie" in server.ask(target, cookie=False).headers
@@ -373,7 +373,7 @@ def test_every_response_has_restrictive_headers(served: Served) -> None:
         policy = headers["content-security-policy"]
         assert "default-src 'none'" in policy and "http" not in policy and "*" not in policy
         assert "server" not in headers and served.key not in str(headers)
-        if path in of_run:  # of an origin of its own, which may load what lies beside it
+        if path in of_run:  # a page with an opaque origin of its own, which may load what lies beside it
             assert policy.endswith("; sandbox allow-scripts allow-downloads")
             assert headers["access-control-allow-origin"] == "null"
         else:

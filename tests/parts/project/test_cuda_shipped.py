@@ -20,7 +20,7 @@ API = ROOT / "pipeline" / "native" / "cuda" / "api.h"
 LIBRARY = Path(native.__file__).parent / "libsplat_cuda.so"
 EVERY_DEVICE = {75, 80, 86, 89, 90, 100, 120}
 NEWEST = 120
-FAT_MAGIC = 0xBA55ED50  # of what nvcc packs for several devices
+FAT_MAGIC = 0xBA55ED50  # first word of a container in which nvcc packs code for several devices
 PTX, MACHINE_CODE = 1, 2
 SYSTEM = re.compile(r"lib(stdc\+\+|gcc_s|c|m|dl|rt|pthread)\.so\.\d+|ld-linux.*")
 

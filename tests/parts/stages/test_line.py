@@ -65,8 +65,8 @@ def test_a_run_leaves_what_is_promised(demo_run: Path) -> None:
 
 def test_a_second_run_does_nothing(demo_options: list[str], demo_copy: Path) -> None:
     before = sha256(demo_copy / "splat.ply")
-    told = answered("run", capture_path(), demo_copy, *demo_options)
-    assert ran(told) == []
+    result = answered("run", capture_path(), demo_copy, *demo_options)
+    assert ran(result) == []
     assert sha256(demo_copy / "splat.ply") == before
 
 
@@ -122,8 +122,8 @@ def test_the_figures_can_be_recomputed_from_the_pictures(demo_run: Path) -> None
 
 
 def test_status_names_every_stage(demo_run: Path) -> None:
-    told = answered("status", demo_run)
-    assert [(stage["name"], stage["state"]) for stage in told["stages"]] == [(name, "valid") for name in STAGES]  # type: ignore[index,attr-defined]
+    result = answered("status", demo_run)
+    assert [(stage["name"], stage["state"]) for stage in result["stages"]] == [(name, "valid") for name in STAGES]  # type: ignore[index,attr-defined]
 
 
 def test_a_folder_of_another_disk_or_place_gives_the_same_splat(

@@ -23,7 +23,7 @@ from splatpipe.pipeline.surface.depths.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.depths.sources import DepthSource
 from splatpipe.pipeline.surface.facades import elevation as elevation_module
-from splatpipe.pipeline.surface.facades.elevation import Elevation, ElevationPhotos, draw_elevation, wall_sheet
+from splatpipe.pipeline.surface.facades.elevation import Elevation, ElevationPhotos, draw_elevation, wall_plane
 from splatpipe.pipeline.surface.facades.facades import FacadesTask, make_facades
 from splatpipe.pipeline.surface.facades.facets import Facets, facets_of, upright_facets
 from splatpipe.pipeline.surface.facades.openings import outlines, projections, recesses
@@ -95,9 +95,9 @@ def crs() -> MapCrs:
 
 def places_of(elevation: Elevation) -> np.ndarray:
     """Local places of all cells, as the depth has them; nan where there is none."""
-    lattice = elevation.sheet.lattice
+    lattice = elevation.plane.lattice
     centres = lattice.centres(next(lattice.tiles(4096)))
-    return elevation.sheet.local_from_sheet(
+    return elevation.plane.local_from_plane(
         np.concatenate([centres, elevation.depth[..., None].astype(np.float64)], axis=-1)
     )
 
@@ -191,7 +191,7 @@ def test_depths_and_colours_are_those_of_the_wall() -> None:
     assert abs(np.median(off)) < 0.5 * PIXEL_M
     assert 1.4826 * np.median(np.abs(off - np.median(off))) < 0.7 * PIXEL_M
     assert (np.abs(off) < 2.5 * PIXEL_M).mean() > 0.97
-    lattice = made.sheet.lattice
+    lattice = made.plane.lattice
     height = wall.high_m - (np.arange(lattice.height) + 0.5) * PIXEL_M
     inner = made.depth[(height > 0.1) & (height < EAVES_M - 0.4)][:, 3:-3]
     assert np.isfinite(inner).mean() > 0.99
@@ -203,12 +203,12 @@ def test_depths_and_colours_are_those_of_the_wall() -> None:
 def test_eaves_beyond_the_relief_are_not_smeared_over_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(elevation_module, "BEFORE_M", 0.3)  # the eaves hang half a metre out
     made = drawn("south")
-    shown = made.colour[..., 3] > 0
+    visible = made.colour[..., 3] > 0
     red = (made.colour[..., 0] > 150) & (made.colour[..., 1] < 80)
-    up = made.sheet.lattice.north_m - (np.arange(len(red)) + 0.5) * PIXEL_M
+    up = made.plane.lattice.north_m - (np.arange(len(red)) + 0.5) * PIXEL_M
     below = (up > 0.1) & (up < EAVES_M - 0.15)  # above that there is the roof's own face, at the foot lawn
-    assert shown[below].mean() > 0.85
-    assert (shown & ~red)[below][:, 2:-2].mean() < 0.004
+    assert visible[below].mean() > 0.85
+    assert (visible & ~red)[below][:, 2:-2].mean() < 0.004
     assert np.nanmax(made.depth) < 0.3
 
 
@@ -218,9 +218,9 @@ def test_the_raster_extends_from_corner_to_corner() -> None:
     assert np.abs(corners[:, :2] - true).max() < 2.0 * PIXEL_M
     assert np.ptp(corners[:2, 2]) < 1e-9
     assert corners[0, 2] > corners[2, 2]
-    sheet = south().sheet
-    assert np.allclose(sheet.local_from_sheet(sheet.sheet_from_local(corners)), corners)
-    assert sheet.sheet_from_local(np.array([0.0, -13.0, 2.0]))[2] == pytest.approx(10.0, abs=0.1)  # towards the viewer
+    plane = south().plane
+    assert np.allclose(plane.local_from_plane(plane.plane_from_local(corners)), corners)
+    assert plane.plane_from_local(np.array([0.0, -13.0, 2.0]))[2] == pytest.approx(10.0, abs=0.1)  # towards the viewer
 
 
 def test_threads_change_no_bit_of_an_elevation() -> None:
@@ -251,7 +251,7 @@ def test_a_hole_beside_a_window_is_filled_with_the_wall() -> None:
 
 def test_an_elevation_of_too_many_pixels_is_refused() -> None:
     with pytest.raises(SplatpipeError, match="too large"):
-        wall_sheet(walls()["south"], 1e-5)
+        wall_plane(walls()["south"], 1e-5)
 
 
 class Quiet:
@@ -358,7 +358,7 @@ def test_without_walls_the_list_is_empty_with_a_note(tmp_path: Path) -> None:
 
 
 def test_openings_are_level_rectangles_and_projections_are_traced() -> None:
-    sheet = wall_sheet(Wall("south", np.array([0.0, 0.0]), np.array([8.0, 0.0]), 0.0, 4.0), 0.02)
+    plane = wall_plane(Wall("south", np.array([0.0, 0.0]), np.array([8.0, 0.0]), 0.0, 4.0), 0.02)
     depth = np.random.default_rng(3).normal(0.0, 0.008, (200, 400)).astype(np.float32)
     depth[50:120, 60:110] = -0.16  # a window: 1.2 to 2.2 m, 1.6 to 3 m high
     depth[80, 60:110] = -0.02  # its bar
@@ -368,12 +368,12 @@ def test_openings_are_level_rectangles_and_projections_are_traced() -> None:
     depth[0:30, 340:380] = -0.4  # a roof behind, at the edge of what is known
     depth[0:30, 330:340] = np.nan
     depth[30:34, 330:380] = np.nan
-    (window,) = recesses(depth, sheet)
+    (window,) = recesses(depth, plane)
     assert np.abs(window - [[1.2, 1.6], [2.2, 1.6], [2.2, 3.0], [1.2, 3.0]]).max() < 0.021
-    (canopy,) = projections(depth, sheet)
+    (canopy,) = projections(depth, plane)
     assert np.abs(canopy.min(axis=0) - [4.0, 2.8]).max() < 0.03
     assert np.abs(canopy.max(axis=0) - [6.0, 3.2]).max() < 0.03
-    whole = outlines(depth, sheet)[0]
+    whole = outlines(depth, plane)[0]
     assert np.abs(whole.max(axis=0) - [7.6, 4.0]).max() < 0.05
     assert np.abs(whole.min(axis=0)).max() < 0.05
 

@@ -33,7 +33,7 @@ def exact_photos() -> PhotoSet:
     return photo_set(photos(), GSD_M, 1)
 
 
-def sheet(east: float, cells: int, step: float = 0.25, height: float = 0.0) -> TriangleMesh:
+def flat_mesh(east: float, cells: int, step: float = 0.25, height: float = 0.0) -> TriangleMesh:
     """A level square of the ground."""
     rows, columns = np.divmod(np.arange((cells + 1) ** 2), cells + 1)
     vertices = np.stack([east + columns * step, rows * step, np.full(len(rows), height)], axis=1)
@@ -59,7 +59,7 @@ def shuffled(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def test_the_same_mesh_has_one_order() -> None:
-    mesh = in_order(sheet(0.0, 6))
+    mesh = in_order(flat_mesh(0.0, 6))
     again = in_order(shuffled(mesh))
     np.testing.assert_array_equal(mesh.vertices, again.vertices)
     np.testing.assert_array_equal(mesh.triangles, again.triangles)
@@ -68,7 +68,7 @@ def test_the_same_mesh_has_one_order() -> None:
 
 
 def test_crumbs_are_removed_and_large_pieces_kept() -> None:
-    mesh = together(sheet(0.0, 8), sheet(10.0, 2), sheet(20.0, 4))
+    mesh = together(flat_mesh(0.0, 8), flat_mesh(10.0, 2), flat_mesh(20.0, 4))
     assert remove_small_components(mesh, 0.9).areas().sum() == pytest.approx(4.0 + 1.0)
     kept = remove_small_components(mesh, 1.1)
     assert len(kept.vertices) == 81 and kept.vertices[:, 0].max() <= 2.0
@@ -105,7 +105,7 @@ def test_a_box_without_a_size_has_no_blocks() -> None:
 
 
 def test_vertices_have_the_photos_colours_and_hidden_ones_their_neighbours() -> None:
-    lawn, below = sheet(-4.9, 2, 0.2), sheet(-4.9, 2, 0.2, height=-2.0)
+    lawn, below = flat_mesh(-4.9, 2, 0.2), flat_mesh(-4.9, 2, 0.2, height=-2.0)
     mesh = TriangleMesh(
         np.concatenate([lawn.vertices - [0.0, 4.9, 0.0], below.vertices]), together(lawn, below).triangles
     )
@@ -116,7 +116,7 @@ def test_vertices_have_the_photos_colours_and_hidden_ones_their_neighbours() -> 
 
 
 def test_files_are_read_by_other_programs_in_the_right_place(tmp_path: Path) -> None:
-    mesh = sheet(3.0, 2, height=7.0)
+    mesh = flat_mesh(3.0, 2, height=7.0)
     colours = np.arange(27, dtype=np.uint8).reshape(9, 3) * 9
     uncertain = replace(FRAME, residuals={"uncertainty": {"horizontal_m": 0.02}})
     ring = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
@@ -144,7 +144,7 @@ def test_files_are_read_by_other_programs_in_the_right_place(tmp_path: Path) -> 
 
 def test_glb_has_16_bit_linear_colours_and_is_unlit(tmp_path: Path) -> None:
     colours = np.tile(np.array([[0, 30, 255]], np.uint8), (9, 1))
-    write_mesh(tmp_path, ColouredMesh(sheet(0.0, 2), colours), FRAME, None)
+    write_mesh(tmp_path, ColouredMesh(flat_mesh(0.0, 2), colours), FRAME, None)
     data = (tmp_path / "mesh.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     scene, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -156,7 +156,7 @@ def test_glb_has_16_bit_linear_colours_and_is_unlit(tmp_path: Path) -> None:
 
 
 def test_few_triangles_are_unchanged() -> None:
-    mesh = sheet(0.0, 3)
+    mesh = flat_mesh(0.0, 3)
     assert decimate(mesh, 18) is mesh
 
 

@@ -130,11 +130,11 @@ def test_dark_corners_are_equalised() -> None:
     east, north = np.moveaxis(HEIGHTS.centres(WHOLE), -1, 0)
     points = contiguous((east, north, true_height(east, north)))
     seen = project_points(plain.sources[0].camera, *points).inside & np.isfinite(points[2])
-    shown = [
+    log_colours = [
         np.log(levels_used.sample(0, (source, source.load()), points, seen, HEIGHTS.cell_m)[seen] + OFFSET)
         for levels_used, source in ((levels(plain), plain.sources[0]), (found, sources[0]), (plain.levels, sources[0]))
     ]
-    levelled, dark = (np.subtract(*np.quantile(each - shown[0], [0.95, 0.05])) for each in shown[1:])
+    levelled, dark = (np.subtract(*np.quantile(each - log_colours[0], [0.95, 0.05])) for each in log_colours[1:])
     assert levelled < 0.05
     assert dark > 0.15
 

@@ -29,7 +29,7 @@ from splatpipe.pipeline.surface.ortho.known_cells import known_cells
 from splatpipe.pipeline.surface.ortho.ortho import OrthoTask, make_ortho
 from splatpipe.pipeline.surface.rasters.grid import make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
-from splatpipe.pipeline.surface.sheets.raster_plane import grid_sheets
+from splatpipe.pipeline.surface.sheets.raster_plane import divide_into_sheets
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 from splatpipe.stages import dsm as dsm_stage
 
@@ -253,17 +253,17 @@ def test_sheets_of_a_grid_agree_where_they_meet() -> None:
     grid = make_grid(IN_UTM, np.array([[-6.0, -4.0, -1.0], [6.0, 4.0, 8.0]]), CELL_M)
     low, high = 299.0, 308.0
     whole = np.full((grid.height, grid.width), np.nan)
-    for sheet in grid_sheets(grid, low, high, side=25):
-        plane, part = sheet.sheet, sheet.part
+    for grid_sheet in divide_into_sheets(grid, low, high, side=25):
+        plane, part = grid_sheet.plane, grid_sheet.part
         moved = HeightInput(
             [plane.transform_depths(source) for source in sources()], plane.lattice, plane.relief, LruCache(1 << 30)
         )
         found = tile_heights(moved, Tile(0, 0, part.height, part.width))
-        heights = sheet.heights(found.tile, found.height)
+        heights = grid_sheet.heights(found.tile, found.height)
         whole[part.row : part.row + part.height, part.column : part.column + part.width] = heights
-        back = sheet.heights_over(grid, part, heights)
+        back = grid_sheet.heights_over(grid, part, heights)
         assert np.allclose(back, found.height, atol=1e-4, equal_nan=True)
-        lattice = sheet.lattice_of(grid, part)
+        lattice = grid_sheet.lattice_of(grid, part)
         assert (lattice.width, lattice.height) == (plane.lattice.width, plane.lattice.height)
         assert np.allclose([lattice.east_m, lattice.north_m], [plane.lattice.east_m, plane.lattice.north_m], atol=1e-6)
     local = grid.centres_in_local(Tile(0, 0, grid.height, grid.width), np.where(np.isnan(whole), low, whole))

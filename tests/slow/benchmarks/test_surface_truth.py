@@ -72,7 +72,7 @@ def perfect(truth: SceneTruth) -> tuple[Raster, TruthGrid]:
     return Raster(np.where(there, heights, 0.0)[None], there, grid.affine, CRS), site
 
 
-def counted(site: TruthGrid, raster: Raster) -> dict[str, dict[str, float]]:
+def measured_rows(site: TruthGrid, raster: Raster) -> dict[str, dict[str, float]]:
     return {row["what"]: row for row in measure_dsm(site, raster)}
 
 
@@ -122,18 +122,18 @@ def test_parts_are_where_they_are_built(surface: Triangles) -> None:
 
 def test_the_truth_is_perfect_and_all_of_it_counts(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
-    rows = counted(site, raster)
+    rows = measured_rows(site, raster)
     for what in ("roofs and ground", "roofs", "ground", "metal roof"):
         assert rows[what]["within_3"] == rows[what]["complete"] == 1.0
         assert rows[what]["p95"] == 0.0 and rows[what]["cells"] > 100
     both = rows["roofs"]["cells"] + rows["ground"]["cells"]
     assert rows["roofs and ground"]["cells"] == both
-    assert both * CELL_M**2 > 500.0  # of the 1,500 m² flown over
+    assert both * CELL_M**2 > 500.0  # in the 1,500 m² flown over
 
 
 def test_a_model_one_gsd_too_high_is_noticed(perfect: tuple[Raster, TruthGrid]) -> None:
     raster, site = perfect
-    rows = counted(site, replace(raster, bands=raster.bands + GSD_M))
+    rows = measured_rows(site, replace(raster, bands=raster.bands + GSD_M))
     assert rows["ground"]["bias"] == pytest.approx(1.0, abs=1e-6)
     assert 0.75 < rows["roofs"]["bias"] < 0.99
 
@@ -142,11 +142,11 @@ def test_a_model_that_ends_early_or_has_no_data_is_incomplete(perfect: tuple[Ras
     raster, site = perfect
     there = raster.there.copy()
     there[:, : there.shape[1] // 2] = False
-    row = counted(site, replace(raster, there=there))["roofs and ground"]
+    row = measured_rows(site, replace(raster, there=there))["roofs and ground"]
     assert row["complete"] == row["within_3"] < 0.7
     cut = Raster(raster.bands[:, :100, :100], raster.there[:100, :100], raster.affine, CRS)
     small = site_of(site.truth, cut, open_world(true_frame(CRS)).crs_from_local)
-    row = counted(small, cut)["roofs and ground"]
+    row = measured_rows(small, cut)["roofs and ground"]
     assert row["complete"] == row["within_3"] < 0.5
 
 
@@ -154,7 +154,7 @@ def test_a_smoothed_model_is_wrong_at_the_eaves_which_count_separately(perfect: 
     raster, site = perfect
     held = raster.bands[0]
     smooth = sum(np.roll(held, (r, c), (0, 1)) for r in (-1, 0, 1) for c in (-1, 0, 1)) / 9.0
-    rows = counted(site, replace(raster, bands=smooth[None]))
+    rows = measured_rows(site, replace(raster, bands=smooth[None]))
     assert rows["ground"]["within_3"] > 0.99 and rows["apart: near steps"]["within_3"] < 0.9
 
 

@@ -45,8 +45,8 @@ def wait(page: Page, until: Callable[[Any], bool]) -> Any:
     """The page's state, as soon as it is as expected."""
 
     def state() -> Any:
-        shown = page.evaluate("splatpipe.live.state()")
-        return shown if shown is not None and until(shown) else None
+        page_state = page.evaluate("splatpipe.live.state()")
+        return page_state if page_state is not None and until(page_state) else None
 
     return wait_until(state, "what the page is to say")
 
@@ -54,11 +54,11 @@ def wait(page: Page, until: Callable[[Any], bool]) -> Any:
 def wait_for_losses(out: Path) -> None:
     """Until the training has begun; its first checkpoint comes 20 seconds later."""
     log = out / "events.jsonl"
-    before = len(log.read_bytes())  # of the run that it was copied from
+    before = len(log.read_bytes())  # written by the run that it was copied from
     wait_until(lambda: b'"loss"' in log.read_bytes()[before:], "the training")
 
 
-def shown(page: Page, name: str) -> np.ndarray:
+def displayed_image(page: Page, name: str) -> np.ndarray:
     """Return the image that the page shows, as received."""
     page.locator(f"#{name}:not([hidden])").wait_for()
     address = page.evaluate(f"document.getElementById('{name}').src")
@@ -86,7 +86,7 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         assert [stage["state"] for stage in state["stages"] if stage["name"] in ("ingest", "undistort")] == [
             "reused"
         ] * 2
-        first, photo = shown(page, "render"), shown(page, "photo")
+        first, photo = displayed_image(page, "render"), displayed_image(page, "photo")
         assert first.shape == photo.shape
         hold(process, signal.SIGCONT)
         follow_the_curves(page, len(state["curves"]["loss"]))
@@ -94,14 +94,14 @@ def test_the_page_follows_a_training_from_its_start_to_its_stop(
         state = wait(page, lambda state: state["model"]["kind"] == "checkpoint" and state["model"]["iteration"] > 200)
         wait_for_picture(page, "(before) => document.getElementById('render').src !== before", before)
         assert page.locator("#iteration").inner_text().startswith("iteration ")
-        assert psnr(shown(page, "render"), photo) > psnr(first, photo) + 3.0
+        assert psnr(displayed_image(page, "render"), photo) > psnr(first, photo) + 3.0
         choose(page, 12)
-        far = shown(page, "photo")
+        far = displayed_image(page, "photo")
         assert far.shape == photo.shape
         choose(page, 1)  # its number is a prefix of the other's
         page.keyboard.press("ArrowRight")
         wait_for_picture(page, SHOWS, 2)
-        assert not np.array_equal(shown(page, "photo"), far)
+        assert not np.array_equal(displayed_image(page, "photo"), far)
         process.send_signal(signal.SIGTERM)
         process.wait(timeout=TIMEOUT_S)
         wait(page, lambda state: not state["at_work"])

@@ -24,10 +24,10 @@ from splatpipe.pipeline.app.view.marking.photo import without_metadata
 TWELVE = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08", "P15", "P16", "P17", "P18")
 
 
-MARKS = 4  # of a point
+MARKS = 4  # a point
 
 
-GSD_M = 0.0278  # of the whole capture; that of the marked photos is smaller
+GSD_M = 0.0278  # ground sample distance of the whole capture; that of the marked photos is smaller
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +285,7 @@ def test_only_requests_of_the_page_itself_are_written(marking: tuple[Served, Pat
     assert [body for body in bad if posted(server, json.dumps(body).encode()) != 400] == []
     for raw in (b"", b"{", b"\xff\xfe", b"[" * 8000, b'{"point":' * 1000):
         assert posted(server, raw) == 400
-    page = open_page((CAPTURE / "truth.json").as_uri()).page  # of another origin, with the cookies it may have
+    page = open_page((CAPTURE / "truth.json").as_uri()).page  # another origin, with the cookies it may have
     sent = "(url) => fetch(url, { method: 'POST', mode: 'no-cors', body: '{}' }).then(() => 'sent', () => 'refused')"
     page.evaluate(sent, f"{server.address}{server.pages}/api/mark/change")
     assert not file.exists()

@@ -18,7 +18,7 @@ from timeouts import TIMEOUT_S, wait_until
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.report import write_report
-from splatpipe.pipeline.app.report.charts.pictures import CHIP_SIDE
+from splatpipe.pipeline.app.report.charts.pictures import CROP_SIDE_PX
 from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
 from splatpipe.stages.line import LINE
 
@@ -108,8 +108,8 @@ def test_held_out_photos_come_worst_first_and_the_slider_moves_the_cut(
     order = [view["name"] for view in sorted(views, key=lambda view: view["psnr"])]
     rows = watched.page.locator("#views tbody th").all_inner_texts()
     assert rows == order
-    shown = watched.page.locator("#views article h3").all_inner_texts()
-    assert shown == order[: len(shown)] or shown == [*order[: len(shown) - 1], order[-1]]
+    titles = watched.page.locator("#views article h3").all_inner_texts()
+    assert titles == order[: len(titles)] or titles == [*order[: len(titles) - 1], order[-1]]
     view = watched.page.locator("#views article").first
     view.scroll_into_view_if_needed()
     box = view.locator(".photo").bounding_box()
@@ -136,13 +136,13 @@ def test_each_mark_of_the_surveyor_has_a_cut_out_with_both_positions(
     section = watched.page.locator("section.point", has=watched.page.locator("h4", has_text="P05"))
     assert section.locator(".chip").count() == len(point["observations"])
     worst = max(point["observations"], key=lambda seen: math.hypot(*seen["residual_px"]))
-    chip = section.locator(".chip").first
-    assert worst["photo"] in chip.inner_text() and f"{math.hypot(*worst['residual_px']):.2f} px" in chip.inner_text()
-    x, y = map(float, re.match(r"M([\d.]+) ([\d.]+)v24", chip.locator(".mark").get_attribute("d")).groups())
-    circle = chip.locator(".found")
+    crop = section.locator(".chip").first
+    assert worst["photo"] in crop.inner_text() and f"{math.hypot(*worst['residual_px']):.2f} px" in crop.inner_text()
+    x, y = map(float, re.match(r"M([\d.]+) ([\d.]+)v24", crop.locator(".mark").get_attribute("d")).groups())
+    circle = crop.locator(".found")
     apart = (float(circle.get_attribute("cx")) - x, float(circle.get_attribute("cy")) - y - 12.0)
     for drawn, true in zip(apart, worst["residual_px"], strict=True):
-        assert math.isclose(drawn * CHIP_SIDE / 100.0, true, abs_tol=0.02)
+        assert math.isclose(drawn * CROP_SIDE_PX / 100.0, true, abs_tol=0.02)
 
 
 def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open_page: Callable[..., object]) -> None:
@@ -169,7 +169,7 @@ def test_a_run_stopped_in_training_has_a_truthful_report(copy_of_run: Path, open
     progress = [event["data"]["done"] for event in events if event["data"].get("what") == "training"]
     steps = [event["data"]["step"] for event in events if event["kind"] == "metric"]
     assert iteration == max(*progress, *steps)
-    assert "30 trained on, 10 held out" in words(watched)  # of the plan that it had
+    assert "30 trained on, 10 held out" in words(watched)  # as planned for this training
     assert state_of(watched, "train") == "stopped" and state_of(watched, "sparse") == "earlier run"
     assert watched.page.locator("#training .chart").count() == 2
     assert watched.page.locator("#views").count() == 0 and "PSNR" not in watched.page.locator(".cards").inner_text()

@@ -100,8 +100,8 @@ def root(model: Gaussians) -> LevelNode:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> ViewerScene:
     dataset = tiny_scene.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset")
     frame = Frame("arbitrary", Similarity(1.0, UP_FROM_DOWN, np.zeros(3)))
-    look = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01)
-    return viewer_scene(dataset, frame, look, (), COUNT, "Tiny </title> site")
+    rendering = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01)
+    return viewer_scene(dataset, frame, rendering, (), COUNT, "Tiny </title> site")
 
 
 @pytest.fixture(scope="module")
@@ -206,9 +206,9 @@ def test_a_missing_file_is_reported_once_and_leaves_no_hole(site: Path, open_pag
         watched = open_page(f"{host.address}/index.html", WIDTH, HEIGHT)
         page = watched.page
         page.evaluate("() => splatpipe.ready.then(() => splatpipe.complete())")
-        shown = page.evaluate("() => splatpipe.shown()")
-        assert leaf["file"] not in shown["files"]
-        assert len(shown["files"]) > 3  # the others came
+        page_state = page.evaluate("() => splatpipe.shown()")
+        assert leaf["file"] not in page_state["files"]
+        assert len(page_state["files"]) > 3  # the others came
         assert "is missing (404)" in page.locator("#notice").inner_text()
         assert host.asked[leaf["file"]] == 3
         host.missing = set()

@@ -14,7 +14,7 @@ from served import Served, serving
 from view_home import SECRET, WEB, refused
 
 # Not by wait_for_function: it evaluates text in the page, which the page's policy forbids.
-SHOWN = """new Promise(done => {
+WAIT_FOR_VIDEO = """new Promise(done => {
   const video = document.querySelector('video');
   video.readyState >= 2 ? done() : video.addEventListener('loadeddata', () => done());
 })"""
@@ -175,22 +175,22 @@ def test_report_film_files_and_web_viewer_work_in_their_sandbox(
     out = linked_copy(demo_run, tmp_path / "out")
     answered("export", out, "--format", "web")
     with serving(out) as server:
-        shown = [open_page(server.file(name), 390, 400) for name in ("web/index.html", "viewer.html")]  # in software
-        for watched in shown:
+        pages = [open_page(server.file(name), 390, 400) for name in ("web/index.html", "viewer.html")]  # in software
+        for watched in pages:
             watched.page.evaluate("splatpipe.ready")
             assert watched.page.evaluate("origin") == "null"
-        with shown[1].page.expect_download() as saved:
-            shown[1].page.keyboard.press("x")  # the picture of the view
+        with pages[1].page.expect_download() as saved:
+            pages[1].page.keyboard.press("x")  # the picture of the view
         assert saved.value.suggested_filename.endswith(".png")
         report = open_page(server.file("report.html"))
         page = report.page
         assert page.locator("h1").count() == 1
         assert page.evaluate("[...document.images].every(image => image.naturalWidth > 0)")
-        assert [watched.errors for watched in (*shown, report)] == [[], [], []]
+        assert [watched.errors for watched in (*pages, report)] == [[], [], []]
         with page.expect_download() as saved:
             page.locator("a[href='splat.ply']").first.click()
         assert Path(saved.value.path()).read_bytes() == (out / "splat.ply").read_bytes()
         page.goto(server.file("flythrough.webm"))
-        page.evaluate(SHOWN)
+        page.evaluate(WAIT_FOR_VIDEO)
         page.goto(server.file("metrics.json"))
         assert "psnr" in page.content()

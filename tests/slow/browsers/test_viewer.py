@@ -34,7 +34,8 @@ from splatpipe.pipeline.web.viewer_scene import ViewerRendering, upright, viewer
 
 LIKE_OURS_DB = 25.0
 UP_FROM_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the tiny scene's −y is up
-RIDGE_M = np.array([[-6.35, 0.0, 9.12], [6.35, 0.0, 9.12]])  # of the demo's roof, in its plot, 10 cm from its ends
+# Ends of the demo's ridge, in its plot, 10 cm from the roof's edges.
+RIDGE_M = np.array([[-6.35, 0.0, 9.12], [6.35, 0.0, 9.12]])
 FROM_ABOVE = "DJI_0023.JPG"
 BREAKOUT = "</script><script>document.title = 'broken'</script>"
 Opened = Callable[..., "Page"]
@@ -68,9 +69,9 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def write_tiny(folder: Path, title: str = "Tiny", largest_bytes: float = 1e9, model: Gaussians | None = None) -> None:
     dataset = tiny_scene.write_dataset(folder / "dataset")
     frame = Frame("arbitrary", Similarity(1.0, UP_FROM_DOWN, np.zeros(3)))
-    look = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01, sky=tiny_sky())
+    rendering = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01, sky=tiny_sky())
     model = tiny_scene.true_model() if model is None else model
-    scene = viewer_scene(dataset, frame, look, ["flight 1/photo_0.png"], len(model), title)
+    scene = viewer_scene(dataset, frame, rendering, ["flight 1/photo_0.png"], len(model), title)
     turned = model.transformed(1.0, torch.from_numpy(UP_FROM_DOWN), torch.zeros(3, dtype=torch.float64))
     write_viewer(folder, scene, turned, largest_bytes)
 
@@ -121,7 +122,7 @@ def test_the_demos_page_shows_what_our_rasterizer_renders(demo_run: Path, view: 
     model = read_splat(part(demo_run, "train", "model"))
     options, _ = as_trained(part(demo_run, "train", "rendering"), model)
     sky = read_panorama(part(demo_run, "train", "sky"))
-    cameras = [shown.camera for shown in load_views(part(demo_run, "undistort", "dataset"))][::13]
+    cameras = [photo_view.camera for photo_view in load_views(part(demo_run, "undistort", "dataset"))][::13]
     page = view(demo_run / "viewer.html", cameras[0].width, cameras[0].height)
     for camera in cameras:
         size = {"width": camera.width, "height": camera.height}
@@ -429,8 +430,10 @@ def test_sections_and_volumes_are_lines_a_list_and_a_chart(tiny_measured: Path, 
     page.mouse.move(box["x"] + box["width"] * 0.99, box["y"] + 20)
     assert page.locator("#reading").inner_text() == "3.00 m: height 501.50 m ± 2.0 cm"
     dot = page.evaluate("() => splatpipe.project([1.5, 0, 1.5])")
-    shown = page.locator("#labels > .dot:not([hidden])").bounding_box()
-    assert np.hypot(shown["x"] + shown["width"] / 2 - dot["x"], shown["y"] + shown["height"] / 2 - dot["y"]) < 2.0
+    dot_box = page.locator("#labels > .dot:not([hidden])").bounding_box()
+    assert (
+        np.hypot(dot_box["x"] + dot_box["width"] / 2 - dot["x"], dot_box["y"] + dot_box["height"] / 2 - dot["y"]) < 2.0
+    )
     page.mouse.move(box["x"] + box["width"] * 0.66, box["y"] + 20)
     assert page.locator("#reading").inner_text() == "2.00 m: no height here"
     volume.click()
@@ -460,8 +463,8 @@ def test_the_screenshot_is_the_rendered_image(tiny: Path, view: Opened, tmp_path
     with page.expect_download() as download:
         page.locator("#screenshot").click()
     download.value.save_as(tmp_path / "shot.png")
-    shot = np.asarray(Image.open(tmp_path / "shot.png").convert("RGB"))
-    np.testing.assert_array_equal(shot, picture(page))
+    screenshot = np.asarray(Image.open(tmp_path / "shot.png").convert("RGB"))
+    np.testing.assert_array_equal(screenshot, picture(page))
 
 
 def test_a_photo_on_its_side_is_shown_upright() -> None:

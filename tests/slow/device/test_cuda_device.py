@@ -34,7 +34,7 @@ COUNT = 20_000
 WIDTH, HEIGHT = 403, 299  # no whole tiles
 WHOLE = (0, 0, WIDTH, HEIGHT)
 MIN_DB = 60.0  # between renders: single pixels lie on a threshold of alpha
-MAX_RELATIVE = 1e-3  # of a gradient's norm: the same, and other orders of sums
+MAX_RELATIVE = 1e-3  # error over a gradient's norm: equal terms in other orders of sums
 SSIM_WEIGHT = 0.2
 
 
@@ -78,8 +78,8 @@ def everything(model: Gaussians, where: torch.device, depth: bool, part: Rectang
     options = RenderOptions(3, (0.1, 0.5, 0.9), antialias=not depth, depth=depth, magnitudes=not depth)
     render = rasterizer.render(leaves, view, options, means2d_probe=probe)
     mask = (torch.arange(HEIGHT)[:, None] + torch.arange(WIDTH) > 100).to(where)
-    shown = affine_colour(render.colour, affine)
-    loss = photo_loss(shown, photo()[here].to(where), SSIM_WEIGHT, mask[here], inner)
+    compensated = affine_colour(render.colour, affine)
+    loss = photo_loss(compensated, photo()[here].to(where), SSIM_WEIGHT, mask[here], inner)
     if depth:
         loss = loss + 0.01 * (render.depth_sum.mean() + render.depth_square_sum.mean())
     loss.backward()

@@ -50,11 +50,11 @@ def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturb
     frozen, models = read_splat(undisturbed / "frozen.ply"), []
     calls, call = Counter[str](), CudaKernels.call
 
-    def counted(kernels: CudaKernels, name: str, *arguments: object) -> None:
+    def count_call(kernels: CudaKernels, name: str, *arguments: object) -> None:
         calls[name] += 1
         call(kernels, name, *arguments)
 
-    def look(state: TrainState, photo: TrainingPhoto) -> None:
+    def observe(state: TrainState, photo: TrainingPhoto) -> None:
         if state.iteration == 8:  # density control has not acted yet
             models.append(state.gaussians.detach().clone())
             around = state.drawn.detach().after(len(state.gaussians))
@@ -67,8 +67,8 @@ def test_block_trains_with_cuda_kernels_as_on_the_cpu(site: SiteParts, undisturb
         for name in ("plan.json", "frozen.ply"):
             (out / name).write_bytes((undisturbed / name).read_bytes())
         with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill), use_kernels(kernels):
-            patch.setattr(CudaKernels, "call", counted)
-            step_with(patch, look)
+            patch.setattr(CudaKernels, "call", count_call)
+            step_with(patch, observe)
             trained(site, out)
     assert calls["splat_step"] == calls["splat_forward"] == 8 and calls["splat_project_backward"] == 0
     begun = Block.of(CONFIG, site, TASK, cpu()).start()

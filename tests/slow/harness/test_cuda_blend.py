@@ -27,7 +27,7 @@ BACKGROUND, DEPTH_ORIGIN = (0.3, 0.1, 0.7), 4.0
 
 # Tolerances of float32 against float64, as those of the CPU's kernels (test_raster_native.py).
 COLOUR = 1e-5  # sums of hundreds of rounded terms of size 1
-DEPTH = 1e-4  # the same, of depths up to 10
+DEPTH = 1e-4  # sums of hundreds of rounded depths up to 10
 GRADIENT = 3e-5  # L2 over all Gaussians, relative
 DOUBTFUL = 10  # pixels at most, in which a rounding decides: two alphas at the cap, 0.99, leave the threshold, 1e-4
 DOUBT_LOG2 = 3e-5  # how near to a threshold that is, in log2(alpha)
@@ -157,8 +157,8 @@ def blend_exactly(name: str, depth: bool) -> tuple[Answer, dict[str, Tensor]]:
         depth_sum, square_sum = depth_sum + weight * met_at, square_sum + weight * (met_at - DEPTH_ORIGIN) ** 2
         passes = blended & (left > MEDIAN_TRANSMITTANCE) & (after <= MEDIAN_TRANSMITTANCE)
         centre = leaves["depth"][i].detach()
-        shown = met_at.detach().clamp((1.0 - MEDIAN_SHIFT_MAX) * centre, (1.0 + MEDIAN_SHIFT_MAX) * centre)
-        median = median.where(~passes, shown)
+        limited = met_at.detach().clamp((1.0 - MEDIAN_SHIFT_MAX) * centre, (1.0 + MEDIAN_SHIFT_MAX) * centre)
+        median = median.where(~passes, limited)
         left = torch.where(blended, after, left)
     pictures = {
         "colour": (colour + left * torch.tensor(BACKGROUND)[:, None, None]).permute(1, 2, 0),
@@ -191,7 +191,7 @@ def random_gradients(scene: Scene, depth: bool, where: Tensor) -> dict[str, Tens
 class Lists:
     """The pairs of a scene in chunks, as the phases before the blending leave them."""
 
-    ranks: list[NDArray[np.int64]]  # of each tile, from near to far
+    ranks: list[NDArray[np.int64]]  # per tile, from near to far
     chunk_begin: NDArray[np.int32]
     tile_begin: NDArray[np.int64]
     slots_of: NDArray[np.uint32]

@@ -20,7 +20,7 @@ from splatpipe.pipeline.raster.optim import Adam, sh_rates
 from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, kernels_name, render
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
-MIN_PSNR = 60.0  # of a device's render beside the CPU's, dB: an eighth of a step of eight bits
+MIN_PSNR = 60.0  # agreement of a device's render with the CPU's, dB: an eighth of a step of eight bits
 GRADIENT_RTOL = 1e-3  # L2; the device's exponential and reciprocals are faster and less exact
 RATES = {"means": 1e-4, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "sh": sh_rates(16, 2.5e-3, 1.25e-4)}
 STEPS = 3

@@ -95,7 +95,7 @@ CASES: dict[str, Callable[[], RenderCase]] = {
 
 
 @functools.cache
-def settled(library: CudaLibrary, name: str) -> tuple[RenderCase, RenderOutcome, RenderOutcome]:
+def case_and_outcomes(library: CudaLibrary, name: str) -> tuple[RenderCase, RenderOutcome, RenderOutcome]:
     """A case with the results of harness and definition; gradients are zero where a rounding decides."""
     case = CASES[name]()
     ours, exact = run(library, case), exact_outcome(case)
@@ -108,13 +108,13 @@ def settled(library: CudaLibrary, name: str) -> tuple[RenderCase, RenderOutcome,
 
 @pytest.mark.parametrize("name", CASES)
 def test_frame_and_every_gradient_are_those_of_the_definition(library: CudaLibrary, name: str) -> None:
-    _, ours, exact = settled(library, name)
+    _, ours, exact = case_and_outcomes(library, name)
     assert picture_complaints(ours, exact) + gradient_complaints(ours, exact) == []
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_frame_and_every_gradient_are_those_of_the_cpus_kernels(library: CudaLibrary, name: str) -> None:
-    case, ours, _ = settled(library, name)
+    case, ours, _ = case_and_outcomes(library, name)
     native = exact_outcome(case, "native")
     assert picture_complaints(ours, native) + gradient_complaints(ours, native) == []
 
@@ -124,7 +124,7 @@ def test_frame_and_every_gradient_are_those_of_the_cpus_kernels(library: CudaLib
 def test_order_of_threads_and_blocks_gives_the_same_bits(
     library: CudaLibrary, as_it_was: ctypes.CDLL, name: str, order: tuple[int, int]
 ) -> None:
-    case, ours, _ = settled(library, name)
+    case, ours, _ = case_and_outcomes(library, name)
     as_it_was.harness_order(*order)
     assert run(library, case).differs(ours) == []
 
@@ -133,14 +133,14 @@ def test_order_of_threads_and_blocks_gives_the_same_bits(
 def test_size_of_the_device_gives_the_same_bits(
     library: CudaLibrary, as_it_was: ctypes.CDLL, multiprocessors: int
 ) -> None:
-    case, ours, _ = settled(library, "thousands")
+    case, ours, _ = case_and_outcomes(library, "thousands")
     as_it_was.harness_multiprocessors(multiprocessors)
     assert run(library, case).differs(ours) == []
 
 
 @pytest.mark.parametrize("name", ["pixels that end", "long", "one tile with everything", "magnitudes, no depth"])
 def test_chunks_and_passes_give_the_same_bits(library: CudaLibrary, name: str) -> None:
-    case, ours, _ = settled(library, name)
+    case, ours, _ = case_and_outcomes(library, name)
     pairs, least = ours.facts[0], case.count
     chunks = set()
     for capacity, passes in ((least, 1), (least, 2), (pairs - 1, 1), (pairs, 1), (pairs * 2 // 3 + 1, 4)):
@@ -156,7 +156,7 @@ def test_what_exceeds_the_forecast_is_the_work_of_all_blocks(
     library: CudaLibrary, as_it_was: ctypes.CDLL, passes: int
 ) -> None:
     """Only prefix sums are one block's; a whole backward pass by one would take seconds on a card."""
-    case, ours, _ = settled(library, "thousands")
+    case, ours, _ = case_and_outcomes(library, "thousands")
     before = as_it_was.harness_switches(), as_it_was.harness_switches_alone()
     again = run(library, case, case.count, passes)
     work, alone = as_it_was.harness_switches() - before[0], as_it_was.harness_switches_alone() - before[1]

@@ -82,8 +82,8 @@ def device_loss(
     value, gradient = untouched(1, dtype=torch.float64), untouched(height, width, 3)
     pointer, size, kept = memory_of(kernels.splat_loss_bytes(width, height))
     pictures = (at(render), at(photo), at(mask if mask is None else mask.view(torch.uint8)), width, height)
-    counted = None if inner is None else ctypes.byref(SplatRectangle(*inner))
-    weighted = (counted, ctypes.c_double(weight), at(gradient), at(value), pointer, size)
+    inner_rectangle = None if inner is None else ctypes.byref(SplatRectangle(*inner))
+    weighted = (inner_rectangle, ctypes.c_double(weight), at(gradient), at(value), pointer, size)
     called(kernels, kernels.splat_photo_loss, *pictures, *weighted)
     assert bool((kept[-(512 - 256) :] == 0xFF).all()), "written past the memory"
     return float(value), gradient

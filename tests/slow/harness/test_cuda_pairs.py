@@ -58,7 +58,7 @@ def place(request: pytest.FixtureRequest) -> DeviceSetup:
     return DeviceSetup(kernels, (3840, 2160), 67_000, 1 << 25)
 
 
-def sheets(count: int) -> tuple[Tensor, ...]:
+def covering_discs(count: int) -> tuple[Tensor, ...]:
     """Discs that cover the whole view, from near to far."""
     generator = torch.Generator().manual_seed(3)
     means = torch.zeros(count, 3)
@@ -101,7 +101,7 @@ def rendered(place: DeviceSetup, parameters: tuple[Tensor, ...]) -> PairsResult:
 
 
 def test_a_view_of_very_many_pairs_is_that_of_its_nearest_gaussians(place):
-    everything = sheets(place.count)
+    everything = covering_discs(place.count)
     assert (1.0 - OPACITY) ** NEAREST < 1e-5
     ours = rendered(place, everything)
     nearest = rendered(place, tuple(tensor[:NEAREST] for tensor in everything))

@@ -25,7 +25,7 @@ RATES = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-
 SH_REST = 2.5e-3 / 20
 MULTIPROCESSORS = 3  # the harness's own number
 TURNS = 2200  # rows: with one multiprocessor, blocks have several turns
-LIMITS = (-2.5, -0.5)  # of log_scales: random ones lie on both sides
+LIMITS = (-2.5, -0.5)  # least and largest log-scale: random ones lie on both sides
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ class StepSettings:
     sparse: bool = True
     gain: np.ndarray | None = None
     unaligned: bool = False
-    rows: int | None = None  # of those rendered, all
+    rows: int | None = None  # number of rendered rows that the step updates; None for all
 
     def moments(self, case: RenderCase) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         rng = np.random.default_rng(8)
@@ -201,7 +201,7 @@ def test_fused_step_is_that_of_the_gradients(library: CudaLibrary, sh_degree: in
     moved = (ours.arrays["mean sh"] != means["sh"]).any(axis=(1, 2))
     assert (moved == (visible if sparse else True)).all()
     low, high = LIMITS
-    log_scales = ours.arrays["value log_scales"]  # of all rows, moved or not
+    log_scales = ours.arrays["value log_scales"]  # every row is clamped, moved or not
     assert log_scales.min() == np.float32(low)
     assert log_scales.max() == np.float32(high)
 
@@ -328,7 +328,7 @@ class Tensors:
 @pytest.mark.parametrize("masked", [False, True])
 def test_adam_is_the_cpus(library: CudaLibrary, masked: bool, unaligned: bool) -> None:
     tensors = Tensors.random(601, (3, 1, 64, 13))
-    for row, tensor in ((0, 0), (255, 2), (256, 3), (600, 1)):  # of both blocks' ends
+    for row, tensor in ((0, 0), (255, 2), (256, 3), (600, 1)):  # first and last rows of both blocks
         tensors.gradients[tensor][row, -1] = np.nan if row % 2 else np.inf
     if masked:
         visible = (np.random.default_rng(1).random(601) < 0.5).astype(np.uint8)

@@ -24,7 +24,7 @@ from splatpipe.pipeline.train.techniques.techniques import make_techniques
 OPTIONS = tiny_scene.plain(
     iterations=400, exposure="affine", antialias=True, robust=0.1, distortion_weight=0.05, dropout=0.2
 )
-LOOKS = [TrainingSize(1)] * 3 + [TrainingSize(0, 800)] * 9
+SIZES = [TrainingSize(1)] * 3 + [TrainingSize(0, 800)] * 9
 """Whole photos, then windows: six per photo, some of a masked photo."""
 STEP_SHARE = 1e-3  # L2 of the parameters' displacements: 5e-6 here; Adam's first step depends only on the sign
 SCORE_RTOL = 1e-4  # L2 of the gradients on the screen, after as many steps
@@ -37,11 +37,11 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[View]:
 
 
 def trained(views: list[View], cache: Path, kernels: CudaKernels | None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Parameters and exposures, and what density control has observed, after every iteration of ``LOOKS``."""
+    """Parameters and exposures, and what density control has observed, after every iteration of ``SIZES``."""
     plan = make_plan(OPTIONS, views, tiny_scene.split_of(views), tiny_scene.GAUSSIANS)
-    with use_kernels(kernels), same_bits(1), PhotoStream.over(views, LOOKS, 0, 1, cache) as photos:
+    with use_kernels(kernels), same_bits(1), PhotoStream.over(views, SIZES, 0, 1, cache) as photos:
         training = TrainState.begin(tiny_scene.true_model(), plan, make_techniques(plan, views=views))
-        assert plan.schedule.density.first > len(LOOKS), "the Gaussians stay the same"
+        assert plan.schedule.density.first > len(SIZES), "the Gaussians stay the same"
         for photo in photos:
             iterate(training, plan, photo)
     beside = {name: torch.as_tensor(array) for name, array in training.techniques.to_arrays().items()}

@@ -34,8 +34,8 @@ def children_of(pid: int) -> list[int]:
 
 
 def is_alive(pid: int) -> bool:
-    shown = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
-    return bool(shown.strip()) and not shown.strip().startswith("Z")
+    listing = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
+    return bool(listing.strip()) and not listing.strip().startswith("Z")
 
 
 def test_one_that_dies_ends_the_others_and_is_reported() -> None:
@@ -48,12 +48,12 @@ def test_one_that_dies_ends_the_others_and_is_reported() -> None:
 def test_an_interruption_ends_them_at_once() -> None:
     seen: list[int] = []
 
-    def look() -> None:
+    def observe() -> None:
         seen[:] = children_of(os.getpid())
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_children([sleeping(), sleeping()], look, "idling")
+        run_children([sleeping(), sleeping()], observe, "idling")
     assert seen and not any(map(is_alive, seen))
 
 

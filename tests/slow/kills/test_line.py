@@ -40,8 +40,8 @@ def test_kill_9_in_every_stage_loses_nothing(photos: Path, undisturbed: Path, tm
             f"{stage} was not hit: {died.stderr.decode()[-2000:]}{of_stage[-4000:]}"
         )
         assert not list((out / "stages").glob(f"{stage}-*")), f"{stage} was left in spite of the kill"
-    told = answered("run", photos, out, *sets(*every))
-    assert ran(told) == [STAGES[-1]]
+    result = answered("run", photos, out, *sets(*every))
+    assert ran(result) == [STAGES[-1]]
     assert sha256(out / "splat.ply") == sha256(undisturbed / "splat.ply")
 
 

@@ -19,8 +19,8 @@ def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp
     fewer.write_text("\n".join(line for line in lines if not line.endswith(" P15")))
     before = json.loads((copy_of_run / "metrics.json").read_text())
     for file in (fewer, more):
-        told = answered("georef", copy_of_run, "--gcp", file)
-        assert ran(told) == ["control", "targets", "georef", "evaluate", "export", *SURFACES]
+        result = answered("georef", copy_of_run, "--gcp", file)
+        assert ran(result) == ["control", "targets", "georef", "evaluate", "export", *SURFACES]
     after = json.loads((copy_of_run / "metrics.json").read_text())
     assert before["accuracy"]["splat"] is None and after["psnr"] == before["psnr"]
     tables = after["accuracy"]["tables"]
@@ -28,8 +28,8 @@ def test_control_given_to_a_finished_run_retrains_nothing(copy_of_run: Path, tmp
     assert after["accuracy"]["splat"]["points"]
     assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:32633"
     assert ran(answered("georef", copy_of_run)) == []
-    told = answered("georef", copy_of_run, *sets("georef.crs=EPSG:31255"))
-    assert "train" not in ran(told) and ran(told)[-3:] == ["export", *SURFACES]
+    result = answered("georef", copy_of_run, *sets("georef.crs=EPSG:31255"))
+    assert "train" not in ran(result) and ran(result)[-3:] == ["export", *SURFACES]
     assert json.loads((copy_of_run / "georef.json").read_text())["crs"]["id"] == "EPSG:31255"
 
 
@@ -37,8 +37,8 @@ def test_a_reconstruction_of_another_program_enters_at_georef(photos: Path, copy
     larger = sets(*QUICK, "undistort.max_megapixels=0.1")
     answered("run", photos, copy_of_run, *larger, "--until", "undistort")
     dataset = next(path for path in (copy_of_run / "stages").glob("undistort-*/dataset") if is_larger(path))
-    told = answered("run", dataset, tmp_path / "other", *sets(*QUICK))
-    assert ran(told) == [name for name in STAGES if name not in ("features", "matches", "sparse")]
+    result = answered("run", dataset, tmp_path / "other", *sets(*QUICK))
+    assert ran(result) == [name for name in STAGES if name not in ("features", "matches", "sparse")]
     metrics = json.loads((tmp_path / "other" / "metrics.json").read_text())
     assert metrics["registered"] == 12
 
@@ -50,9 +50,9 @@ def is_larger(dataset: Path) -> bool:
 
 def test_a_budget_is_planned_shown_and_reused(photos: Path, copy_of_run: Path) -> None:
     budgets = ("--time-budget", "8s", "--max-memory", "4G")
-    told = answered("run", photos, copy_of_run, *sets(*QUICK), *budgets)
+    result = answered("run", photos, copy_of_run, *sets(*QUICK), *budgets)
     retrained = ["blocks", "train", "clean", "evaluate", "export", "flythrough"]
-    assert ran(told) == [*retrained, *SURFACES]  # which it turns off
+    assert ran(result) == [*retrained, *SURFACES]  # which it turns off
     events = [json.loads(line) for line in (copy_of_run / "events.jsonl").read_text().splitlines()]
     notes = [event["data"]["message"] for event in events if event["kind"] == "note"]
     assert any(note.startswith("plan: ") and "8 s budget, within 4.0 GB" in note for note in notes), notes

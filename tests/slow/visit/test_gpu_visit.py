@@ -278,8 +278,8 @@ def test_a_broken_first_kernel_ends_the_visit_and_is_told(place: Place, planted:
     visited = place.visit("first", {"limits": limits, "parts": parts}, fault, environment)
     states = {name: state for name, state in visited.states.items() if state != "done"}
     assert list(states)[:2] == ["smoke", "smoke under memcheck"]
-    told = (states.pop("smoke"), states.pop("smoke under memcheck"))
-    assert told == {"wrong": ("failed", "refused"), "hang": ("late", "late")}[fault]
+    outcomes = (states.pop("smoke"), states.pop("smoke under memcheck"))
+    assert outcomes == {"wrong": ("failed", "refused"), "hang": ("late", "late")}[fault]
     assert set(states.values()) == {"not begun"}
     assert visited.lines[-1]["red"][0] == "smoke"
     if fault == "wrong":

@@ -92,8 +92,8 @@ def page(content: object, *, drawn: bool = True, photos: int = 32) -> str:
     with styled():
         section = adjustment_section(found, [CAMERA], ORIGIN, places(photos) if drawn else None)
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(TEMPLATES), autoescape=True, trim_blocks=True)
-    shown = environment.get_template("adjustment.html.j2").render(georeferencing={"adjustment": section})
-    return " ".join(shown.split())
+    html = environment.get_template("adjustment.html.j2").render(georeferencing={"adjustment": section})
+    return " ".join(html.split())
 
 
 def inputs_of(
@@ -110,31 +110,31 @@ def inputs_of(
 
 
 def test_the_page_has_heights_remedies_residuals_and_lens() -> None:
-    shown = page(made_up())
-    assert shown.count("<svg role=") == 3
-    assert "Heights of the ground are uncertain by ±0.87 m together (95 %)" in shown
+    text = page(made_up())
+    assert text.count("<svg role=") == 3
+    assert "Heights of the ground are uncertain by ±0.87 m together (95 %)" in text
     for title, bound in (("the flight as it is", "±0.87 m"), ("one control point", "±6.3 cm"), ("three", "±5.5 cm")):
-        assert re.search(rf"{title}[^<]*</th><td>{bound}", shown), title
-    assert re.search("cross strip at another height</th><td>±8.3 cm", shown)
-    assert "1: 8 m east and 4 m north of the origin (45.03153" in shown and "2: 40 m west and 21 m south" in shown
-    assert "Camera positions that the fit did not use are predicted to 2.6 cm" in shown
-    assert "proves neither the focal length nor the height" in shown and "leaves no residual" in shown
-    assert '1,966 px</td><td>19 px (0.96 %)</td><td class="word">radial k1 (-0.95)' in shown
-    assert "aspect (fy / fx − 1)" in shown and "DJI FC6360" in shown
-    assert "times as long; the longest is" in shown
-    assert "nan" not in shown.replace("nance", "")
+        assert re.search(rf"{title}[^<]*</th><td>{bound}", text), title
+    assert re.search("cross strip at another height</th><td>±8.3 cm", text)
+    assert "1: 8 m east and 4 m north of the origin (45.03153" in text and "2: 40 m west and 21 m south" in text
+    assert "Camera positions that the fit did not use are predicted to 2.6 cm" in text
+    assert "proves neither the focal length nor the height" in text and "leaves no residual" in text
+    assert '1,966 px</td><td>19 px (0.96 %)</td><td class="word">radial k1 (-0.95)' in text
+    assert "aspect (fy / fx − 1)" in text and "DJI FC6360" in text
+    assert "times as long; the longest is" in text
+    assert "nan" not in text.replace("nance", "")
 
 
 def test_without_images_it_has_the_figures() -> None:
-    shown = page(made_up(), drawn=False)
-    assert "<svg" not in shown and "±0.87 m" in shown and "1: 8 m east and 4 m north of the origin;" in shown
+    text = page(made_up(), drawn=False)
+    assert "<svg" not in text and "±0.87 m" in text and "1: 8 m east and 4 m north of the origin;" in text
 
 
 def test_what_the_page_says_of_the_remedies_is_what_was_computed() -> None:
-    shown = page(made_up(), drawn=False)
+    text = page(made_up(), drawn=False)
     across, _, height = (100.0 * sigma for sigma in CONTROL_SIGMAS_M)
-    assert f"surveyed to {across:g} cm, and {height:g} cm in height" in shown
-    assert (MARK_SIGMA_PX, OTHER_HEIGHT) == (0.5, 0.25) and "half a pixel" in shown and "a quarter higher" in shown
+    assert f"surveyed to {across:g} cm, and {height:g} cm in height" in text
+    assert (MARK_SIGMA_PX, OTHER_HEIGHT) == (0.5, 0.25) and "half a pixel" in text and "a quarter higher" in text
     assert round(NORMAL_95, 2) == adjustment.NORMAL_95
     for value in (0.00512, 0.0349, 0.0994, 0.0996, 0.445, 3.26, 99.0, 1234.0):
         assert two_digits(value) == metres_in_words(value)
@@ -144,10 +144,10 @@ def test_what_the_page_says_of_the_remedies_is_what_was_computed() -> None:
 def test_with_control_there_are_lens_and_heights_without_remedies() -> None:
     content = made_up()
     content = {"lenses": content["lenses"], "heights": content["heights"] | {"remedies": {}, "sentence": None}}
-    shown = page(content)
-    assert "Heights of the ground are known to ±0.87 m together (95 %)" in shown
-    assert shown.count("<svg role=") == 1 and "proposed control" not in shown and "the flight as it is" not in shown
-    assert "Camera positions in the adjustment" not in shown and "leaves no residual" not in shown
+    text = page(content)
+    assert "Heights of the ground are known to ±0.87 m together (95 %)" in text
+    assert text.count("<svg role=") == 1 and "proposed control" not in text and "the flight as it is" not in text
+    assert "Camera positions in the adjustment" not in text and "leaves no residual" not in text
 
 
 def damaged(content: Any, chance: random.Random) -> Any:
@@ -168,8 +168,8 @@ def test_damaged_entries_are_left_out(seed: int) -> None:
         made_up(12) | {"heights": made_up()["heights"] | {"map": [[0.0, 0.0, 0.4], [9.0, 1.0, 0.4]]}}, chance
     )
     content = json.loads(json.dumps(content if isinstance(content, dict) else {}))
-    shown = page(content, drawn=seed % 3 == 0)
-    assert HOSTILE not in shown
+    text = page(content, drawn=seed % 3 == 0)
+    assert HOSTILE not in text
     judge(inputs_of({"adjustment": content}))
 
 
@@ -192,12 +192,12 @@ def test_equal_residuals_and_sigmas_and_few_places_can_be_drawn() -> None:
 
 
 def test_a_thousand_photos_of_many_flights_stay_small() -> None:
-    shown = page(made_up(1000, flights=9), photos=1000)
-    assert shown.count("<svg role=") == 2 + adjustment.MAX_FLIGHTS
-    assert "3 shorter flights are only in accuracy.json" in shown
-    ids = re.findall(r'\bid="([^"]+)"', shown)
+    text = page(made_up(1000, flights=9), photos=1000)
+    assert text.count("<svg role=") == 2 + adjustment.MAX_FLIGHTS
+    assert "3 shorter flights are only in accuracy.json" in text
+    ids = re.findall(r'\bid="([^"]+)"', text)
     assert len(ids) == len(set(ids))
-    assert len(shown) < 1_000_000
+    assert len(text) < 1_000_000
 
 
 def test_strips_end_where_the_flight_turns() -> None:

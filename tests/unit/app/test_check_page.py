@@ -57,11 +57,11 @@ def test_a_finding_on_the_whole_capture_shows_example_photos(demo_names: list[st
     )
     preflight = grid(capture_path(), demo_names, findings=findings)
     photos = tuple(replace(it, sharpness=0.5 + 0.01 * i) for i, it in enumerate(preflight.photos))
-    shown = [
+    photo_names = [
         [it.name for it in pictures if not it.beside]
         for pictures in finding_pictures(replace(preflight, photos=photos))
     ]
-    assert shown == [demo_names[-1:], demo_names[4:6], demo_names[:3], []]
+    assert photo_names == [demo_names[-1:], demo_names[4:6], demo_names[:3], []]
 
 
 def test_names_on_the_map_do_not_cover_each_other() -> None:

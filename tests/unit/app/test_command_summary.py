@@ -8,7 +8,7 @@ def test_names_that_the_environment_cannot_write_are_told_with_what_to_do() -> N
     try:
         "run \udcc3\udcbc".encode()
     except UnicodeEncodeError as error:
-        shown = for_the_user(error)
-    assert isinstance(shown, MachineError)
-    assert "letters that this environment cannot write" in shown.message
-    assert "LC_ALL=C.UTF-8" in shown.hint
+        user_error = for_the_user(error)
+    assert isinstance(user_error, MachineError)
+    assert "letters that this environment cannot write" in user_error.message
+    assert "LC_ALL=C.UTF-8" in user_error.hint

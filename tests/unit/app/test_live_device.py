@@ -51,30 +51,30 @@ def card(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return places
 
 
-def shown() -> LoadedModel:
+def loaded_model() -> LoadedModel:
     return LoadedModel(tiny_scene.true_model(), None, RenderOptions(3, depth=False), None, 0)
 
 
 def test_images_are_rendered_on_the_runs_device_if_it_has_free_memory(
     view: View, card: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = pictures(shown(), view, 1, "cpu")
+    expected = pictures(loaded_model(), view, 1, "cpu")
     assert card == ["cpu"]
     least = int(LEFT_SHARE * WHOLE) + RENDER_BYTES * tiny_scene.GAUSSIANS
     for asked, free, place in (("auto", least, "cuda"), ("cuda", WHOLE, "cuda"), ("auto", least - 1, "cpu")):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device, free=free: (free, WHOLE))
         card.clear()
-        assert pictures(shown(), view, 1, asked) == expected
+        assert pictures(loaded_model(), view, 1, asked) == expected
         assert card == [place]
     monkeypatch.setattr(checkpoint_render, "choose_device", lambda wanted: cpu())
-    assert pictures(shown(), view, 1, "auto") == expected
+    assert pictures(loaded_model(), view, 1, "auto") == expected
     assert card == ["cpu", "cpu"]
 
 
 def test_if_the_card_turns_out_full_the_cpu_renders(
     view: View, card: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = pictures(shown(), view, 1, "cpu")
+    expected = pictures(loaded_model(), view, 1, "cpu")
     watched = checkpoint_render.placed
 
     def full(model: Model, device: Device) -> Model:
@@ -84,12 +84,12 @@ def test_if_the_card_turns_out_full_the_cpu_renders(
         return there
 
     monkeypatch.setattr(checkpoint_render, "placed", full)
-    assert pictures(shown(), view, 1, "auto") == expected
+    assert pictures(loaded_model(), view, 1, "auto") == expected
     assert card == ["cpu", "cuda", "cpu"]
 
 
 def test_if_the_card_fails_the_cpu_renders(view: View, card: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = pictures(shown(), view, 1, "cpu")
+    expected = pictures(loaded_model(), view, 1, "cpu")
     watched, said = checkpoint_render.placed, ["CUDA error: unspecified launch failure\nCUDA kernel errors might be"]
 
     def fails(*given: object) -> None:
@@ -101,11 +101,11 @@ def test_if_the_card_fails_the_cpu_renders(view: View, card: list[str], monkeypa
 
     monkeypatch.setattr(checkpoint_render, "placed", failing)
     monkeypatch.setattr(torch.cuda, "empty_cache", fails)
-    assert pictures(shown(), view, 1, "auto") == expected
+    assert pictures(loaded_model(), view, 1, "auto") == expected
     assert card == ["cpu", "cuda", "cpu"]
     said[0] = "The size of tensor a (3) must match"  # a mistake of ours is not hidden
     with pytest.raises(RuntimeError, match="size of tensor"):
-        pictures(shown(), view, 1, "auto")
+        pictures(loaded_model(), view, 1, "auto")
 
 
 def test_the_device_is_that_of_the_training_then_that_of_the_run() -> None:
@@ -120,7 +120,7 @@ def test_the_page_renders_on_the_device_of_the_current_run(
 ) -> None:
     source = ModelSource(tmp_path, "checkpoint", "stamp", None)
     monkeypatch.setattr(checkpoint_render, "newest", lambda opened: source)
-    monkeypatch.setattr(checkpoint_render, "load", lambda source, opened: shown())
+    monkeypatch.setattr(checkpoint_render, "load", lambda source, opened: loaded_model())
     monkeypatch.setattr(Live, "_refresh", lambda live: (live._log.read(), (Contents(), (view,)))[1])
     for asked, machine in (("cpu", {"device": "cpu"}), ("cuda", {"device": "auto"}), ("cuda", 3)):
         event = {"kind": "run_started", "stage": "", "data": {"stages": ["train"], "machine": machine}, "time_s": 1.0}

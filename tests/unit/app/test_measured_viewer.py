@@ -229,6 +229,6 @@ def test_an_invalid_record_shows_nothing(out: Path, text: str) -> None:
 
 
 def test_a_huge_record_is_not_read(out: Path) -> None:
-    os.truncate(out / MEASURED, measurements.LARGEST_FILE + 1)
+    os.truncate(out / MEASURED, measurements.MAX_FILE_BYTES + 1)
     (surface,) = Store(out).artifacts("dsm")
     assert read_measurements(out, "volumes", surface.parts["dsm.files"].digest) == []

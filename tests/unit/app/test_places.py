@@ -46,8 +46,8 @@ PLACES = PathLabels.of(
         ("copied from smb://nas to sftp://host:22/home/jane/x y.tif", "copied from  to x y.tif"),
     ],
 )
-def test_folders_are_left_out(said: str, shown: str) -> None:
-    assert PLACES.plain(said) == shown
+def test_folders_are_left_out(said: str, expected: str) -> None:
+    assert PLACES.plain(said) == expected
 
 
 @pytest.mark.parametrize(

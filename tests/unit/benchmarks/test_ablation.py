@@ -56,7 +56,7 @@ def test_the_variants_beside_the_script_are_all_valid() -> None:
     whole = {each.name: variants.config_of((*base, *each.sets), 0) for each in chosen}
     assert len({config.model_dump_json() for config in whole.values()}) == len(whole)  # each changes something
     assert all(each.what for each in chosen)
-    # the same in every variant
+    # Options that every variant sets alike.
     unlike_presets = {"iterations": 7, "least_iterations": 7, "max_megapixels": 0.5, "stop_when_flat": 0.0}
     alone = whole["defaults"].train.model_copy(update=unlike_presets)
     assert alone == TrainConfig().model_copy(update=unlike_presets)
@@ -110,8 +110,8 @@ def test_every_figure_of_a_run_is_kept_whatever_was_measured(tmp_path: Path) -> 
         "floaters.views.pairs": 3,
         "loss": None,
     }
-    (shown,) = comparison.means([row("base", "a", 0, **found)], ["base"])
-    assert shown["free space"] == "0.250000" and "depth off" not in shown and "loss" not in shown
+    (row_text,) = comparison.means([row("base", "a", 0, **found)], ["base"])
+    assert row_text["free space"] == "0.250000" and "depth off" not in row_text and "loss" not in row_text
 
 
 def test_results_survive_a_truncated_line(tmp_path: Path) -> None:

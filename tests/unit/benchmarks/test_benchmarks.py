@@ -55,10 +55,10 @@ def test_contributing_pairs_are_those_of_the_definition(dataset: Path, opacity_l
     gaussians.opacity_logits[:] = opacity_logit  # the last: pixels end early
     plan = make_plan(tiny_scene.plain(), load_views(dataset), tiny_scene.split_of(load_views(dataset)), len(gaussians))
     for camera in tiny_scene.cameras()[::4]:
-        counted = measure.contributing_pairs(gaussians, camera, plan, 1)
+        pairs = measure.contributing_pairs(gaussians, camera, plan, 1)
         expected = pairs_by_definition(gaussians, camera, RenderOptions(0, near=plan.near))
         # In float32 a few alphas are on the other side of 1/255, and a few pixels saturate a Gaussian earlier or later.
-        assert expected > 5000 and abs(counted - expected) <= 2e-3 * expected
+        assert expected > 5000 and abs(pairs - expected) <= 2e-3 * expected
 
 
 def test_window_speed_compares_windows_with_whole_photos_of_their_size(dataset: Path, tmp_path: Path) -> None:
@@ -70,6 +70,6 @@ def test_window_speed_compares_windows_with_whole_photos_of_their_size(dataset: 
     assert whole["counted_megapixels"] == whole["rendered_megapixels"] == pytest.approx(MEGAPIXELS)
     assert 0.5 * MEGAPIXELS < parts["counted_megapixels"] <= window_speed.ROUNDING * MEGAPIXELS
     assert parts["counted_megapixels"] < parts["rendered_megapixels"]
-    assert parts["pairs_per_pixel"] == pytest.approx(whole["pairs_per_pixel"], rel=0.35)  # the same scene, nearer
+    assert parts["pairs_per_pixel"] == pytest.approx(whole["pairs_per_pixel"], rel=0.35)  # one scene, nearer
     assert whole["ratio"] == whole["mean_ratio"] == whole["ratio_per_counted"] == 1.0
     assert math.isclose(parts["mean_ratio"], parts["cpu_mean_s"] / whole["cpu_mean_s"])

@@ -49,7 +49,7 @@ def test_a_shift_by_half_a_cell_affects_only_slopes() -> None:
     row = judged(shifted, where=on_roof())
     off = 0.5 * CELL * 0.8 / np.hypot(1.0, 0.8) / GSD
     assert row["p95"] == pytest.approx(off) and off > 0.6
-    assert max(abs(row["bias"]), row["nmad"]) > 0.6  # of two values the median may be either: then the bias shows it
+    assert max(abs(row["bias"]), row["nmad"]) > 0.6  # the median of two values may be either: then the bias shows it
 
 
 def test_a_shift_by_a_whole_cell_is_tolerated_at_steps_only() -> None:

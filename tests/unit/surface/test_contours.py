@@ -17,7 +17,7 @@ from splatpipe.pipeline.surface.rasters.geotiff import HEIGHTS, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
 from splatpipe.pipeline.survey.crs.frames import Frame
 
-LINE_STRING, HAS_Z = 2, 0x80000000  # of WKB
+LINE_STRING, HAS_Z = 2, 0x80000000  # codes in WKB
 
 
 def traced(path: Path, grid: Grid, interval: float | None = 0.5) -> Contours:

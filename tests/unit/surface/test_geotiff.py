@@ -27,9 +27,9 @@ from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
 from splatpipe.pipeline.survey.crs.frames import Frame
 
 STEP_M = 0.5 / 1024.0  # half of a height's step
-RINGING = 10  # of JPEG beside the black outside, of 90
+RINGING = 10  # largest error by JPEG beside the black outside, of a value of 90
 FORMS = {"heights": HEIGHTS, "confidence": CONFIDENCE, "colours": COLOURS, "jpeg": COLOURS_AS_JPEG}
-EXTRA_SAMPLES, UNASSOCIATED_ALPHA = 338, 2  # of TIFF 6.0
+EXTRA_SAMPLES, UNASSOCIATED_ALPHA = 338, 2  # TIFF 6.0's tag and value
 
 
 def write_colours(path: Path, grid: Grid, form: RasterForm) -> np.ndarray:

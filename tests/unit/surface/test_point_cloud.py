@@ -16,8 +16,8 @@ from splatpipe.pipeline.surface.rasters.grid import make_grid
 from splatpipe.pipeline.surface.shapes.point_cloud import CloudChunk, CloudFrame, write_cloud
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
-HALF_STEP_M = 0.0005 + 2e-4  # of a millimetre, and the grid's transformation to the CRS
-NORMAL_DEG = 0.5  # of three signed bytes
+HALF_STEP_M = 0.0005 + 2e-4  # half a step of a millimetre, and the grid's transformation to the CRS
+NORMAL_DEG = 0.5  # rounding of a normal to three signed bytes
 
 
 def some_points(count: int, seed: int = 0) -> CloudChunk:

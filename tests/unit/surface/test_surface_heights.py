@@ -95,8 +95,8 @@ def test_noise_holes_and_wrong_patches_are_tolerated() -> None:
 def test_expected_deviations_are_no_smaller_than_the_errors() -> None:
     made = made_noisy()
     off, clear = errors(made)
-    counted = clear & np.isfinite(off)
-    assert np.mean(np.abs(off[counted]) < 2 * made.sigma[counted]) > 0.9
+    valid = clear & np.isfinite(off)
+    assert np.mean(np.abs(off[valid]) < 2 * made.sigma[valid]) > 0.9
 
 
 def test_tiles_threads_and_memory_change_no_bit() -> None:
@@ -112,7 +112,7 @@ def test_tiles_threads_and_memory_change_no_bit() -> None:
 
 
 def test_large_rasters_are_made_in_parts() -> None:
-    whole, parts = made_noisy(), tile_heights(capture(noisy()), WHOLE, most=60_000)  # of 180,000
+    whole, parts = made_noisy(), tile_heights(capture(noisy()), WHOLE, most=60_000)  # a third of the 180,000 cells
     assert np.array_equal(parts.height, whole.height, equal_nan=True)
     assert np.array_equal(parts.sigma, whole.sigma, equal_nan=True)
     assert np.array_equal(parts.photos, whole.photos)
@@ -130,14 +130,14 @@ def test_a_turned_sheet_gives_the_same_surface() -> None:
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]]
     turn[:3, 3] = [0.5, -0.2, -2.0]
-    sheet = RasterPlane(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), HeightRange(-3.0, 6.0))
-    sources = [sheet.transform_depths(DepthSource(found.camera, lambda found=found: found)) for found in exact()]
-    made = tile_heights(HeightInput(sources, sheet.lattice, sheet.relief, LruCache(1 << 30)), Tile(0, 0, 50, 60))
-    places = np.concatenate([sheet.lattice.centres(made.tile), made.height[..., None]], axis=-1)
-    east, north, up = np.moveaxis(sheet.local_from_sheet(places), -1, 0)
+    plane = RasterPlane(turn, Lattice(-6.0, 5.0, CELL_M, 60, 50), HeightRange(-3.0, 6.0))
+    sources = [plane.transform_depths(DepthSource(found.camera, lambda found=found: found)) for found in exact()]
+    made = tile_heights(HeightInput(sources, plane.lattice, plane.relief, LruCache(1 << 30)), Tile(0, 0, 50, 60))
+    places = np.concatenate([plane.lattice.centres(made.tile), made.height[..., None]], axis=-1)
+    east, north, up = np.moveaxis(plane.local_from_plane(places), -1, 0)
     clear = edge_distance(east, north) > 2 * CELL_M
     assert np.abs(up - true_height(east, north))[clear].max() < 0.2 * PIXEL_M  # on the round tree
-    assert np.allclose(sheet.sheet_from_local(sheet.local_from_sheet(places)), places, equal_nan=True)
+    assert np.allclose(plane.plane_from_local(plane.local_from_plane(places)), places, equal_nan=True)
 
 
 def test_places_that_only_two_photos_see_have_no_height() -> None:

@@ -79,7 +79,7 @@ def test_a_cone_on_a_slope_has_its_volume_on_the_ground(tmp_path: Path, crs: str
     surface = surface_file(tmp_path, grid, 0.05 * east - 0.02 * north + cone(east, north))
     found = measure_volume(surface, square(8.0), grid.crs, "rim")
     assert found.cut.m3 == pytest.approx(CONE_M3, rel=2e-3)
-    assert found.fill.m3 < 0.2  # of heights on whole steps, over 256 m²
+    assert found.fill.m3 < 0.2  # the rounding to whole steps of height, over 256 m²
     assert found.area_m2 == pytest.approx(256.0, rel=1e-4)
     assert found.known_m2 == pytest.approx(256.0, rel=2e-3)
     assert found.base.misfit_m is not None
@@ -114,7 +114,8 @@ def test_an_outline_divides_cells(tmp_path: Path) -> None:
 def noise_of(seed: int, shape: tuple[int, int]) -> np.ndarray:
     """Return noise with the spatial correlation that the module assumes."""
     field = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(shape), (0, 0), SHARED_CELLS)
-    return np.asarray(field * (NOISE_M * 2.0 * math.sqrt(math.pi) * SHARED_CELLS))  # of a blur of white noise
+    # Deviation NOISE_M after the blur of white noise.
+    return np.asarray(field * (NOISE_M * 2.0 * math.sqrt(math.pi) * SHARED_CELLS))
 
 
 TRIALS = 24

@@ -32,9 +32,9 @@ def seen_and_gradient(view: PanoramaView, colours: Tensor) -> tuple[Tensor, Tens
 
 
 VIEWS = [
-    skies.view(heading_deg=170.0, pitch_deg=20.0).scaled(83, 61),  # over the seam of the azimuth
-    skies.view(heading_deg=20.0, pitch_deg=5.0, roll_deg=50.0).scaled(80, 57),
-    skies.view(pitch_deg=88.0).scaled(64, 48),  # with the pole in the picture
+    skies.aimed_camera(heading_deg=170.0, pitch_deg=20.0).scaled(83, 61),  # over the seam of the azimuth
+    skies.aimed_camera(heading_deg=20.0, pitch_deg=5.0, roll_deg=50.0).scaled(80, 57),
+    skies.aimed_camera(pitch_deg=88.0).scaled(64, 48),  # with the pole in the picture
 ]
 
 
@@ -63,7 +63,7 @@ def test_masks_are_those_of_the_cpu_at_every_size(size: tuple[int, int]) -> None
     mask[60:90, 40:130] = False
     mask[rng.integers(0, 90, 30), rng.integers(0, 320, 30)] = False
     found = SkyMask.packed(mask)
-    camera = skies.view().scaled(*size)
+    camera = skies.aimed_camera().scaled(*size)
     cpu, device = (
         photo_sky_on_cpu(found, camera),
         photo_sky_on_device(torch.from_numpy(found.bits), found.shape, camera),
@@ -75,7 +75,7 @@ def test_masks_are_those_of_the_cpu_at_every_size(size: tuple[int, int]) -> None
 
 
 def test_photos_without_sky_have_none_and_moving_to_a_device_keeps_it() -> None:
-    camera = skies.view()
+    camera = skies.aimed_camera()
     mask = np.ones((60, 80), bool)
     masks = PhotoSkies({camera.name: SkyMask.packed(mask), "other": SkyMask.packed(~mask)})
     sky = SkyModel(skies.UP, np.full((ROWS * COLUMNS, 3), 0.5, np.float32), {camera.name: SkyMask.packed(mask)})
@@ -83,4 +83,4 @@ def test_photos_without_sky_have_none_and_moving_to_a_device_keeps_it() -> None:
     assert sky.panorama.colours is sky.tensors["colours"] and sky.panorama.colours.requires_grad
     assert len(masks) == len(masks.on(torch.device("cpu"))) == sky.photos == 1
     moved = masks.on(torch.device("meta"))
-    assert moved.seen(skies.view(heading_deg=77.0)) is None
+    assert moved.seen(skies.aimed_camera(heading_deg=77.0)) is None

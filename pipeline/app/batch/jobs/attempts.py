@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.files.output_file import appended_file
 from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.engine.stage import JSON
 
-PERMANENT_FAILURES = (EXIT_INPUT, EXIT_USAGE)  # the same photos and options would fail again: not retried
+PERMANENT_FAILURES = (EXIT_INPUT, EXIT_USAGE)  # exit codes not retried: these photos and options would fail again
 SIGNALS = 128  # an exit code above it is that of a signal
 MAX_LOG_BYTES = 16 << 20
 NO_MESSAGE = "It ended without an error message: its process was killed, usually by the system for lack of memory."

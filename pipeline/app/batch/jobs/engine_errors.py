@@ -23,7 +23,7 @@ ERRORS_FILE = "engine.jsonl"  # below a call's folder
 MAX_LOG_BYTES = 16 << 20
 LOG_TAIL_BYTES = 1 << 16
 MEMORY = re.compile(rb"slurmstepd\S*: error: .*\boom[-_]kill\b")
-LONGEST_MESSAGE = 300  # characters of an engine's own words
+MAX_MESSAGE_LETTERS = 300  # characters of an engine's own words
 STATE = re.compile(r"status is: '([A-Z_]+)'")
 BOILERPLATE = re.compile(
     r"sbatch call:.*|For further error details see .*|Detailed failure reason unavailable .*|The error message was|"
@@ -78,7 +78,7 @@ class EngineError:
         if self._state:
             return f"Slurm ended its job {self.job} as {self._state}, before it could say why."
         words = " ".join(BOILERPLATE.sub("", self.message).split()).strip("'. ")
-        return f"Its job failed: {words[:LONGEST_MESSAGE]}." if words else "Its job failed without a message."
+        return f"Its job failed: {words[:MAX_MESSAGE_LETTERS]}." if words else "Its job failed without a message."
 
     @property
     def hint(self) -> str:
@@ -111,13 +111,13 @@ class ErrorRecorder(logging.Filter):
             aux = getattr(record, "aux", None) or {}
             message, job = getattr(record, "rule_msg", None) or "", aux.get("external_jobid") or ""
             log = "".join(logs[-1:])
-            error = EngineError(str(message), str(job), log, killed_for_memory=_tells_of_memory(log))
+            error = EngineError(str(message), str(job), log, killed_for_memory=_mentions_memory(log))
             with appended_file(self._path) as file:
                 file.write(json.dumps({"of": [marker.parent.name, marker.name], **asdict(error)}).encode() + b"\n")
         return True
 
 
-def _tells_of_memory(log: str) -> bool:
+def _mentions_memory(log: str) -> bool:
     """Whether Slurm has written into a job's output that the kernel killed one of its processes for memory."""
     with suppress(OSError, SplatpipeError):
         return MEMORY.search(read_end(Path(log), LOG_TAIL_BYTES)) is not None

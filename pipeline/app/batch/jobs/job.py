@@ -43,7 +43,7 @@ from splatpipe.stages.line import LINE
 
 SPLATPIPE = tuple(python_module("splatpipe.pipeline.app.cli.main"))
 FOLLOW_S = 0.5
-RESERVE_BYTES = 256 << 20  # of the disk, reserved for what other captures' stages write at the same time
+RESERVE_BYTES = 256 << 20  # disk space kept free for what other captures' stages write meanwhile
 
 
 def main() -> None:
@@ -243,7 +243,7 @@ def _ending(code: int, output: bytes, events: Path) -> AttemptResult:
 def _may_be_temporary(events: Path) -> bool:
     """Whether the failure may be temporary: photos changed or were briefly unavailable, as on a network disk."""
     culprit = read_history(events, running=False).culprit
-    return culprit is not None and culprit.state == "failed" and not culprit.lasting
+    return culprit is not None and culprit.state == "failed" and not culprit.permanent
 
 
 def _error_of(output: bytes) -> Mapping[str, JSON]:

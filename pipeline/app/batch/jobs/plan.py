@@ -16,7 +16,7 @@ PLAN_FILE = "plan.json"
 RUNTIME_FACTOR, RUNTIME_MIN = 3.0, 15.0  # a cluster kills jobs at the limit, and extra minutes cost nothing
 MEGABYTE = 10**6
 SHARDS_FOLDER = "shards"  # below a call's folder
-MIN_S = 1.0  # of a process that only joins
+MIN_S = 1.0  # shortest time for a process that only joins
 
 
 @dataclass(frozen=True)

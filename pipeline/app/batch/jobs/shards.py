@@ -16,7 +16,8 @@ NOTHING = Need(memory_bytes=200_000_000, cpu_seconds=1.0, disk_bytes=1_000_000) 
 # Where a job's memory is enforced, these are part of it: two processes of Snakemake, job.py, and the command that waits
 # for the stage's process. Measured with Slurm: 340 MB, and some for the files that they read.
 CLUSTER_BYTES = 450_000_000
-LEAST_EFFICIENCY = 0.5  # of the processors that a stage requests on a cluster, where others could use them
+# Least busy share of the processors that a stage requests on a cluster, where others could use them.
+MIN_EFFICIENCY = 0.5
 
 
 def stage_job(name: str, need: Need, threads: int, *, local: bool = True) -> StageJob:
@@ -36,9 +37,9 @@ def stage_job(name: str, need: Need, threads: int, *, local: bool = True) -> Sta
 
 
 def useful_threads(need: Need, most: int) -> int:
-    """The largest number of threads of which a stage keeps more than ``LEAST_EFFICIENCY`` busy; at least one."""
+    """The largest number of threads of which a stage keeps more than ``MIN_EFFICIENCY`` busy; at least one."""
     one = need.seconds(1)
-    return max((n for n in range(1, most + 1) if one > LEAST_EFFICIENCY * n * need.seconds(n)), default=1)
+    return max((n for n in range(1, most + 1) if one > MIN_EFFICIENCY * n * need.seconds(n)), default=1)
 
 
 def missing_shards(statuses: Iterable[StageStatus]) -> dict[str, list[Shard]]:

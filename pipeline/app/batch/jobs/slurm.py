@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.files.json_file import read_json
 
 QUEUE_FILE = "queue.json"  # below a call's folder
 ASK_INTERVAL_S = 20.0
-PATIENCE_S = 10.0  # a controller that answers later is too busy to be asked
+TIMEOUT_S = 10.0  # a controller that answers later is too busy to be asked
 MEGABYTE = 10**6  # as that of the plans, whose numbers the plugin hands to Slurm
 COMMENT = re.compile(r"rule_(\w+)_wildcards_([0-9A-Za-z-]+)(?:_([0-9]+))?$")
 REASONS = {
@@ -84,7 +84,7 @@ def _answer(words: list[str]) -> str:
     """Output of one of Slurm's commands; empty if it fails."""
     try:
         done = subprocess.run(
-            words, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            words, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
         return ""

@@ -34,7 +34,7 @@ from splatpipe.pipeline.engine.files.small_file import read_end, read_small
 from splatpipe.pipeline.engine.machine import available_cores, free_memory_bytes
 from splatpipe.pipeline.engine.python_module import SAFE_PATH, python_module
 
-END_PATIENCE_S = 8.0  # a run ends within five seconds and Docker kills after ten
+END_TIMEOUT_S = 8.0  # a run ends within five seconds and Docker kills after ten
 POLL_S = 0.05
 MAX_PROFILE_BYTES = 1 << 20
 LOG_TAIL = 4000  # characters of Snakemake's log that are searched for its last message
@@ -183,7 +183,7 @@ def end_group(call: Call, group: int, *, local: bool, has_ended: Callable[[], bo
     """
     with suppress(OSError):  # on a full disk the signals must suffice
         write_file(call.stop_file, "")
-    deadline = time.monotonic() + END_PATIENCE_S
+    deadline = time.monotonic() + END_TIMEOUT_S
     with suppress(ProcessLookupError):
         os.killpg(group, signal.SIGTERM if local else signal.SIGINT)
         while not has_ended() and time.monotonic() < deadline:

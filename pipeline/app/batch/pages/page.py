@@ -20,8 +20,8 @@ TEMPLATES = Path(__file__).resolve().parent / "templates"
 REFRESH_S = 10  # the page's reload interval; the batch rewrites the page somewhat less often
 PICTURE_SIDE = 480  # pixels, of a card on a good display
 SMALL_SIDE = 240  # if there are so many that the page would load slowly
-MANY = 60  # captures
-MAX_LINES = 50  # of a reason; the full text is in the report
+MANY_CAPTURES = 60  # captures
+MAX_LINES = 50  # lines shown of a reason; the full text is in the report
 GROUPS: Sequence[tuple[State, str]] = (  # those that need attention first
     ("failed", "Failed"),
     ("running", "Running"),
@@ -103,7 +103,7 @@ def batch_page(state: BatchState, folder: Path) -> str:
     Raises:
         MachineError: if this installation lacks the page's script or style.
     """
-    side = SMALL_SIDE if len(state.captures) > MANY else PICTURE_SIDE
+    side = SMALL_SIDE if len(state.captures) > MANY_CAPTURES else PICTURE_SIDE
     groups = []
     for name, title in GROUPS:
         captures = sorted((it for it in state.captures if it.state == name), key=lambda it: it.level != "bad")

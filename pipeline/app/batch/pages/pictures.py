@@ -16,7 +16,7 @@ from splatpipe.pipeline.photos.files.names import PHOTO_SUFFIXES
 from splatpipe.pipeline.photos.files.photo_list import photo_root
 
 SIDE = 480  # pixels, of a card on a good display
-POOR_DB = 12.0  # PSNR without exposure compensation: a worse render does not show which capture it is
+MIN_PSNR_DB = 12.0  # PSNR without exposure compensation: a worse render does not show which capture it is
 CANDIDATES = 5  # photos, spread over the capture: some show little but sky, grass, or the ground before take-off
 
 
@@ -64,14 +64,16 @@ def _render(out: Path) -> tuple[Path, int] | None:
         views = sorted(views, key=_view_psnr, reverse=True)
         renders = [(folder / f"{Path(str(view['file'])).name}.render.png", view) for view in views]
         better = renders[: (len(renders) + 1) // 2]
-        good = [(path, view) for path, view in better if path.is_file() and float(view.get("psnr") or 0.0) >= POOR_DB]
+        good = [
+            (path, view) for path, view in better if path.is_file() and float(view.get("psnr") or 0.0) >= MIN_PSNR_DB
+        ]
         if not good:
             return None
         path, view = max(good, key=lambda render: render[0].stat().st_size)
         photos = inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
         turned = {photo["name"]: int(photo.get("orientation") or 1) for photo in photos}
         return path, turned.get(view["name"], 1)
-    except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # of an incomplete run
+    except (SplatpipeError, OSError, ValueError, KeyError, TypeError, AttributeError):  # the run is incomplete
         return None
 
 

@@ -33,10 +33,10 @@ from splatpipe.pipeline.app.report.facts.adjustment_results import PositionResid
 
 ARROW_SHARE = 0.12  # length of the longest residual as a share of the map's width
 SCALE_MARGIN = 0.95  # inches for a colour scale
-MANY = 300  # dots from which they are drawn as an image: smaller than as shapes
+MANY_DOTS = 300  # dots from which they are drawn as an image: smaller than as shapes
 NORMAL_95 = 1.959964
 SPREAD = (2.0, 98.0)  # percentiles of the heights' accuracy between which colours run
-MIN_SPREAD = 0.1  # of their middle: smaller differences do not deserve the whole range of colours
+MIN_SPREAD_SHARE = 0.1  # least range of the colours over its middle: smaller differences do not deserve all colours
 TURN_DEG = 45.0  # change of direction from which a strip ends
 MIN_STRIP = 3  # photos
 
@@ -57,7 +57,7 @@ def positions_map(entries: Sequence[PositionResidual], places: Sequence[Sequence
         axes.plot(*at[own].T, "-", color=LINE, lw=0.9, zorder=1)
     longest = float(np.linalg.norm(residuals[:, :2], axis=1).max())
     scale = max(longest, 1e-9) / (ARROW_SHARE * (box[1] - box[0]))
-    many = len(entries) > MANY
+    many = len(entries) > MANY_DOTS
     axes.quiver(
         *at.T,
         *residuals[:, :2].T,
@@ -144,7 +144,7 @@ def heights_map(
     figure, axes = new_figure(*map_size(box, SCALE_MARGIN), right=SCALE_MARGIN)
     bounds = 100.0 * NORMAL_95 * table[:, 2]
     low, high = np.percentile(bounds, SPREAD).tolist()
-    lacking = max(0.0, MIN_SPREAD * 0.5 * (low + high) - (high - low))
+    lacking = max(0.0, MIN_SPREAD_SHARE * 0.5 * (low + high) - (high - low))
     colours = ScalarMappable(Normalize(max(0.0, low - 0.5 * lacking), high + 0.5 * lacking), "viridis_r")
     axes.plot(*centres.T, "+", ms=4, color=FAINT, mew=0.6, zorder=1, label="camera")
     axes.scatter(
@@ -154,7 +154,7 @@ def heights_map(
         c=colours.to_rgba(bounds),
         linewidths=0,
         zorder=2,
-        rasterized=len(table) > MANY,
+        rasterized=len(table) > MANY_DOTS,
     )
     if len(proposed):
         axes.plot(*proposed[:, :2].T, "^", ms=9, mfc=ORANGE, mec="white", mew=0.8, zorder=4, label="proposed control")

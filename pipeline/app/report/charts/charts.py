@@ -30,12 +30,12 @@ from splatpipe.pipeline.app.report.charts.drawing import (
 )
 from splatpipe.pipeline.app.report.charts.geometry import Geometry, OverlapGrid, ResidualField
 
-POINTS_DRAWN = 20_000  # of a point cloud: more would add nothing at this size
-PAIRS_DRAWN = 3_000  # lines, for the strongest pairs
+MAX_POINTS = 20_000  # most points drawn of a cloud: more would add nothing at this size
+MAX_PAIRS = 3_000  # lines, for the strongest pairs
 OVERLAP_STEPS = (1, 2, 3, 4, 5, 7, 10)  # numbers of photos at which a new colour begins
 OVERLAP_COLOURS = ("#cf222e", "#e8743b", "#f2b134", "#d9d557", "#8cc152", "#4aa564", "#1a6b3c")
 ARROW_SHARE = 0.12  # length of the longest residual as a share of the map's width
-SQUASHED = 4.0  # times the iterations reached: a planned end farther away would squash the curve
+MAX_PLANNED_TIMES = 4.0  # times the iterations reached: a planned end farther away would squash the curve
 METRES_A_DEGREE = 111_195.0  # on a sphere: accurate enough for drawing
 MAX_NAMES = 30  # points with their names on a map
 Residual = tuple[str, Sequence[float], Sequence[float]]  # name, position and residual: east, north, up, metres
@@ -83,9 +83,14 @@ def overlap_map(overlap: OverlapGrid, unit: str) -> Markup:
     """Map of the number of footprints that cover each place."""
     figure, axes = new_figure(*map_size(overlap.box), right=1.15)
     norm = BoundaryNorm([*OVERLAP_STEPS, 10_000], len(OVERLAP_COLOURS))
-    shown = np.ma.masked_equal(overlap.counts, 0)
+    covered_counts = np.ma.masked_equal(overlap.counts, 0)
     axes.imshow(
-        shown, extent=overlap.box, cmap=ListedColormap(OVERLAP_COLOURS), norm=norm, interpolation="nearest", zorder=1
+        covered_counts,
+        extent=overlap.box,
+        cmap=ListedColormap(OVERLAP_COLOURS),
+        norm=norm,
+        interpolation="nearest",
+        zorder=1,
     )
     labels = ["1", "2", "3", "4", "5–6", "7–9", "10 or more"]
     for colour, label in zip(OVERLAP_COLOURS, labels, strict=True):
@@ -101,7 +106,7 @@ def match_map(geometry: Geometry, pairs: Sequence[tuple[str, str, int]], unit: s
     figure, axes = new_figure(*map_size(box))
     places = dict(zip(geometry.photos.names, geometry.photos.centres[:, :2], strict=True))
     known = [pair for pair in pairs if pair[0] in places and pair[1] in places]
-    strongest = sorted(known, key=lambda pair: -pair[2])[:PAIRS_DRAWN][::-1]
+    strongest = sorted(known, key=lambda pair: -pair[2])[:MAX_PAIRS][::-1]
     lines = LineCollection([(places[a], places[b]) for a, b, _ in strongest], cmap="Blues", linewidths=0.9)
     lines.set_array(np.log10([max(1, pair[2]) for pair in strongest]))
     lines.set_clim(0.5, 3.0)
@@ -213,7 +218,7 @@ def training_curve(name: str, curve: Mapping[float, float], planned: float | Non
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
-    if planned and SQUASHED * steps[-1] >= planned > steps[-1]:
+    if planned and MAX_PLANNED_TIMES * steps[-1] >= planned > steps[-1]:
         axes.axvline(planned, color=ORANGE, lw=1.0, ls="--", label=f"planned end: {planned:,.0f}")
         axes.legend(fontsize=8)
     axes.set_xlim(left=0)
@@ -246,7 +251,7 @@ def stage_bars(rows: Sequence[tuple[str, float]], label: str, title: str) -> Mar
 
 
 def _draw_points(axes: Axes, geometry: Geometry) -> None:
-    chosen = np.linspace(0, len(geometry.points) - 1, min(POINTS_DRAWN, len(geometry.points))).astype(int)
+    chosen = np.linspace(0, len(geometry.points) - 1, min(MAX_POINTS, len(geometry.points))).astype(int)
     colours = geometry.colours[chosen] / 255.0
     east, north = geometry.points[chosen, :2].T
     axes.scatter(east, north, s=0.6, c=colours, linewidths=0, rasterized=True, zorder=0)

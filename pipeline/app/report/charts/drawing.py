@@ -38,7 +38,7 @@ STYLE: dict[Any, Any] = {
     "ytick.color": FAINT,
     "legend.frameon": False,
     "figure.dpi": 100,
-    "savefig.dpi": 110,  # of rasterized parts: point clouds
+    "savefig.dpi": 110,  # resolution of rasterized parts: point clouds
 }
 
 

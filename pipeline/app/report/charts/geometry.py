@@ -18,12 +18,12 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
 
 BORDER_STEPS = 6  # rays along each side of an image, for its footprint
-GROUND_PERCENTILE = 5.0  # of the sparse points' heights: roofs and walls are above
-REACH_PERCENTILE = 95.0  # of the distances of a photo's own points, which limits its footprint
+GROUND_PERCENTILE = 5.0  # percentile of the sparse points' heights taken as ground: roofs and walls are above
+REACH_PERCENTILE = 95.0  # percentile of the distances to a photo's own points that limits its footprint
 REACH_POINTS = 20_000  # points used for that: all of them, for hundreds of photos, would take seconds
-MIN_DROP = 0.02  # of a ray's length: flatter rays meet the ground beyond the reach
-BOX_PERCENTILES = (4.0, 96.0)  # of the sparse points: some lie far behind the scene
-BOX_MARGIN = 0.15  # of its longer side
+MIN_DROP = 0.02  # least drop over a ray's length: flatter rays meet the ground beyond the reach
+BOX_PERCENTILES = (4.0, 96.0)  # percentiles of the sparse points that bound the scene: some lie far behind it
+BOX_MARGIN = 0.15  # border around the box, as a share of its longer side
 GRID_CELLS = 240  # along the longer side of the overlap map
 FIELD_CELLS = 16  # along the longer side of an image, for the mean residuals
 FIELD_PHOTOS = 24  # photos used for them: enough observations, and more would take seconds

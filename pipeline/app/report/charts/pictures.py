@@ -19,13 +19,13 @@ from splatpipe.pipeline.photos.files.photo_list import Photo, decode, load_photo
 VIEW_SIDE = 960  # pixels of the longer side of a held-out photo in the report
 VIEW_QUALITY = 82
 MAX_VIEWS = 12  # the worst and the best; the table has the figures of all
-CHIP_SIDE = 48  # photo pixels across a crop: a mark, its surroundings, and a large reprojection error
-WIDEST_CHIP = 768  # if the reprojection error is larger than that
-CHIP_PIXELS = 96  # most pixels across in the report; the browser enlarges smaller crops
-CHIP_QUALITY = 80
-MAX_CHIPS = 600  # about two megabytes; if there are more, the worst of each point have priority
+CROP_SIDE_PX = 48  # photo pixels across a crop: a mark, its surroundings, and a large reprojection error
+MAX_CROP_SIDE_PX = 768  # if the reprojection error is larger than that
+CROP_OUTPUT_PX = 96  # most pixels across in the report; the browser enlarges smaller crops
+CROP_QUALITY = 80
+MAX_CROPS = 600  # about two megabytes; if there are more, the worst of each point have priority
 MAX_DECODED = 1_500_000_000  # pixels of photos decoded for them: about fifteen seconds on one core
-DOUBLE_SHARE = 0.3  # of a photo's longer side, across the crop of a place that may be a double
+DOUBLE_SHARE = 0.3  # side of the crop of a possible double, as a share of the photo's longer side
 DOUBLE_PIXELS = 420  # most pixels across in the report
 ROTATIONS_DEG = {3: 180, 6: 90, 8: 270}  # degrees, clockwise, by EXIF orientation; mirrored ones are left as they are
 ROTATION_CODES = {180: cv2.ROTATE_180, 90: cv2.ROTATE_90_CLOCKWISE, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
@@ -92,7 +92,7 @@ def chosen_views(views: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return [*views[: MAX_VIEWS - 1], views[-1]]
 
 
-def cut_chips(
+def cut_crops(
     points: Sequence[Mapping[str, Any]], photos_part: Path | None, photos_dir: Path | None
 ) -> dict[tuple[int, int], PhotoCrop]:
     """Make a crop for each observation of the surveyed points.
@@ -107,9 +107,9 @@ def cut_chips(
     """
     photos = {} if photos_part is None else load_photo_list(photos_part).by_name()
     by_photo: dict[str, list[tuple[int, int]]] = {}
-    for place in _worst_first(points)[:MAX_CHIPS]:
+    for place in _worst_first(points)[:MAX_CROPS]:
         by_photo.setdefault(str(points[place[0]]["observations"][place[1]]["photo"]), []).append(place)
-    chips: dict[tuple[int, int], PhotoCrop] = {}
+    crops: dict[tuple[int, int], PhotoCrop] = {}
     decoded = 0
     for name, places in by_photo.items():  # the photos with the worst marks first
         photo, pixels = photos.get(name), None
@@ -120,8 +120,8 @@ def cut_chips(
             pixels = _decoded(photo, photos_part, photos_dir)
         for place in places:
             seen = points[place[0]]["observations"][place[1]]
-            chips[place] = _chip(seen, pixels, 1 if photo is None else photo.orientation)
-    return chips
+            crops[place] = _mark_crop(seen, pixels, 1 if photo is None else photo.orientation)
+    return crops
 
 
 def double_crops(
@@ -149,7 +149,7 @@ def double_crops(
         side = max(1, round(DOUBLE_SHARE * max(photo.width, photo.height)))
         cut = shrunk(_cut(pixels, round(x - side / 2), round(y - side / 2), side), DOUBLE_PIXELS)
         crops.append(
-            (str(name), jpeg(np.ascontiguousarray(_rotated(cut, photo.orientation)[:, :, ::-1]), CHIP_QUALITY))
+            (str(name), jpeg(np.ascontiguousarray(_rotated(cut, photo.orientation)[:, :, ::-1]), CROP_QUALITY))
         )
     return crops
 
@@ -176,11 +176,11 @@ def _decoded(photo: Photo, part: Path, photos_dir: Path) -> UInt8[np.ndarray, "h
 
 def _worst_first(points: Sequence[Mapping[str, Any]]) -> list[tuple[int, int]]:
     """Every point's worst observation, then every point's second worst, and so on."""
-    ranked = []
+    by_rank = []
     for i, point in enumerate(points):
         sizes = [(-_size(seen), j) for j, seen in enumerate(point.get("observations", []))]
-        ranked += [(rank, i, j) for rank, (_, j) in enumerate(sorted(sizes))]
-    return [(i, j) for _, i, j in sorted(ranked)]
+        by_rank += [(rank, i, j) for rank, (_, j) in enumerate(sorted(sizes))]
+    return [(i, j) for _, i, j in sorted(by_rank)]
 
 
 def _size(seen: Mapping[str, Any]) -> float:
@@ -188,19 +188,19 @@ def _size(seen: Mapping[str, Any]) -> float:
     return float(np.hypot(*residual)) if residual else 0.0
 
 
-def _chip(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, orientation: int) -> PhotoCrop:
+def _mark_crop(seen: Mapping[str, Any], pixels: UInt8[np.ndarray, "h w 3"] | None, orientation: int) -> PhotoCrop:
     mark = np.array(seen["pixel"], np.float64)
     residual = seen.get("residual_px")
-    side = CHIP_SIDE
-    while residual and max(abs(residual[0]), abs(residual[1])) > 0.4 * side and side < WIDEST_CHIP:
+    side = CROP_SIDE_PX
+    while residual and max(abs(residual[0]), abs(residual[1])) > 0.4 * side and side < MAX_CROP_SIDE_PX:
         side *= 2
     corner = np.floor(mark - side / 2).astype(int)
     picture = None
     if pixels is not None and np.all(mark > -side) and np.all(mark < np.array(pixels.shape[1::-1]) + side):
         cut = _cut(pixels, int(corner[0]), int(corner[1]), side)
-        if side > CHIP_PIXELS:
-            cut = np.asarray(cv2.resize(cut, (CHIP_PIXELS, CHIP_PIXELS), interpolation=cv2.INTER_AREA), np.uint8)
-        picture = jpeg(np.ascontiguousarray(cut[:, :, ::-1]), CHIP_QUALITY)
+        if side > CROP_OUTPUT_PX:
+            cut = np.asarray(cv2.resize(cut, (CROP_OUTPUT_PX, CROP_OUTPUT_PX), interpolation=cv2.INTER_AREA), np.uint8)
+        picture = jpeg(np.ascontiguousarray(cut[:, :, ::-1]), CROP_QUALITY)
     marked = (mark - corner) / side * 100.0
     found = None
     if residual:

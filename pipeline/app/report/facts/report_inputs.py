@@ -120,7 +120,7 @@ def results_digest(inputs: ReportInputs) -> str:
     if history.exit_code or not all(stage.state in ("finished", "reused") for stage in history.stages.values()):
         return ""
     measured = [inputs.out / VOLUMES, *sorted((inputs.out / SECTIONS).glob("*"))]
-    shown = [
+    facts = [
         importlib.metadata.version("splatpipe"),
         inputs.out.resolve().name,
         str(inputs.photos_dir),
@@ -129,7 +129,7 @@ def results_digest(inputs: ReportInputs) -> str:
         [(file.name, file.size, file.current) for file in inputs.deliverables],
         [(path.name, path.stat().st_mtime_ns) for path in measured if path.is_file()],
     ]
-    return hashlib.sha256(json.dumps(shown).encode("utf-8", "surrogatepass")).hexdigest()
+    return hashlib.sha256(json.dumps(facts).encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _configuration(run: RunFolder) -> tuple[LineConfig | None, Path | None]:

@@ -50,7 +50,7 @@ class StageHistory:
         memory_bytes: Peak memory; None if unknown.
         message: The error message if it failed.
         hint: What to do about it.
-        lasting: Whether the same input will fail again.
+        permanent: Whether the same input will fail again.
         messages: Its messages.
     """
 
@@ -62,7 +62,7 @@ class StageHistory:
     memory_bytes: int | None = None
     message: str = ""
     hint: str = ""
-    lasting: bool = False
+    permanent: bool = False
     messages: StageMessages = field(default_factory=StageMessages)
 
     @property
@@ -194,7 +194,7 @@ class _EventReader:
         stopped = code in STOPPED if code is not None else data["message"] == "Stopped."
         stage = self._stage(name, "stopped" if stopped else "failed", data)
         stage.message, stage.hint = str(data["message"]), str(data["hint"])
-        stage.lasting = bool(data.get("lasting"))
+        stage.permanent = bool(data.get("lasting"))
         stage.seconds, stage.memory_bytes = data.get("seconds"), data.get("peak_memory_bytes")
 
     def _progress(self, name: str, data: Facts) -> None:

@@ -28,17 +28,17 @@ from splatpipe.pipeline.survey.points.located_points import Sighting, SurveyPoin
 from splatpipe.pipeline.survey.points.surveyed_points import Survey, with_roles
 
 Marks = Mapping[str, Mapping[str, tuple[float, float]]]
-UNKNOWN_HEIGHT_M = 5.0  # of a point without a height, or while the vertical datum is unknown
+UNKNOWN_HEIGHT_M = 5.0  # standard deviation of an unknown height, or while the vertical datum is unknown
 MIN_RADIUS_PX = 6.0
 SURFACE_RADIUS_M = 8.0  # around a point: its height is taken from the sparse points within
 MIN_NEAR = 3  # sparse points needed for a height
-RAY_TOLERANCE = 1e-3  # of x/z; beyond it, the lens model has folded a ray outside the image back into it
+RAY_TOLERANCE = 1e-3  # error in x/z beyond which the lens model has folded a ray outside the image back into it
 # Times a photo's nearest and farthest sparse point depths: the range in which a mark's ray is followed.
-BEYOND = np.array([0.5, 2.0])
+DEPTH_RANGE_FACTORS = np.array([0.5, 2.0])
 LINE_STEPS = 48  # along the ray: lens distortion bends its image
 NEIGHBOURS = 30  # sparse points around a place: in a photo that shows none of them, the place is most likely occluded
 MAX_WITNESSES = 50_000  # sparse points searched for them
-HELPFUL_MARKS = 4  # of a point: further marks add little
+HELPFUL_MARKS = 4  # marks of a point beyond which further ones add little
 
 
 @dataclass
@@ -278,17 +278,23 @@ class Projector:
             ahead = np.flatnonzero(np.isfinite(seen).all(axis=1) & (seen[:, 2] > 0.0))
             if len(ahead) == 0:
                 continue
-            shown = np.asarray(view.camera.img_from_cam(seen[ahead]), np.float64).reshape(-1, 2)
-            back = np.asarray(view.camera.cam_from_img(shown), np.float64).reshape(-1, 2)
+            projected = np.asarray(view.camera.img_from_cam(seen[ahead]), np.float64).reshape(-1, 2)
+            back = np.asarray(view.camera.cam_from_img(projected), np.float64).reshape(-1, 2)
             true = np.abs(back - seen[ahead, :2] / seen[ahead, 2:]).max(axis=1) < RAY_TOLERANCE
-            shown = shown / view.scale
+            projected = projected / view.scale
             focal = view.camera.mean_focal_length() / view.scale
             spread = np.maximum(MIN_RADIUS_PX, focal * radius_m[ahead] / seen[ahead, 2])
             margin = np.minimum(spread, 0.25 * photo.width)[:, None]
-            inside = true & ((shown >= -margin) & (shown <= np.array([photo.width, photo.height]) + margin)).all(axis=1)
+            inside = true & (
+                (projected >= -margin) & (projected <= np.array([photo.width, photo.height]) + margin)
+            ).all(axis=1)
             rows = ahead[inside]
-            pixels[rows, index], radius[rows, index], depth[rows, index] = shown[inside], spread[inside], seen[rows, 2]
-            beyond = ((shown[inside] < 0.0) | (shown[inside] > [photo.width, photo.height])).any(axis=1)
+            pixels[rows, index], radius[rows, index], depth[rows, index] = (
+                projected[inside],
+                spread[inside],
+                seen[rows, 2],
+            )
+            beyond = ((projected[inside] < 0.0) | (projected[inside] > [photo.width, photo.height])).any(axis=1)
             doubtful[rows, index] = beyond | ~witnessed[rows, index]
         return Projection(pixels, radius, depth, doubtful)
 
@@ -301,7 +307,7 @@ class Projector:
         view = self._job.model.view(sighting.index, self._job.photos[sighting.photo].width)
         pose = view.cam_from_model
         depths = self._cloud[self._shows[:, sighting.index]] @ pose[2, :3] + pose[2, 3]
-        reach = np.percentile(depths, [5.0, 95.0]) * BEYOND if len(depths) else np.array([0.1, 10.0])
+        reach = np.percentile(depths, [5.0, 95.0]) * DEPTH_RANGE_FACTORS if len(depths) else np.array([0.1, 10.0])
         ray = np.append(view.ray(np.array(sighting.pixel)), 1.0)
         near, far = np.maximum(reach, 1e-9).tolist()
         places = (np.geomspace(near, far, LINE_STEPS)[:, None] * ray - pose[:, 3]) @ pose[:, :3]

@@ -30,10 +30,11 @@ from splatpipe.pipeline.survey.files.control_edit import ControlText
 from splatpipe.pipeline.survey.files.control_file import SurveyedPoint
 
 MAX_UNDO = 10_000
-WIDE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing
-HELPFUL_PHOTOS = 20  # of a point, ordered by how much they help; the rest follow by distance
+MAX_RAY_ANGLE_RAD = math.radians(60.0)  # between rays: a larger angle adds nothing
+HELPFUL_PHOTOS = 20  # photos of a point ordered by how much they help; the rest follow by distance
 DIGITS = 2  # decimal places of pixel coordinates in the file
-State = tuple[float, float] | Literal["hidden"] | None  # of a point in a photo: its mark, or not visible, or neither
+# A point in a photo: its mark in pixels, or not visible, or neither.
+State = tuple[float, float] | Literal["hidden"] | None
 
 
 class WrongRequestError(Exception):
@@ -198,13 +199,13 @@ class Marking:
             marks, found = self._text.marks.get(name, {}), self._detections().get(name, {})
             hidden = self._text.hidden
         number = list(self._points).index(name)
-        shown = {s.photo: s for s in estimate.survey.points[number].sightings}
+        sighting_by_photo = {s.photo: s for s in estimate.survey.points[number].sightings}
         index = {photo: k for k, photo in enumerate(self.job.model.names)}
         lines = self._lines(estimate, number)
         rows = []
         for photo in self._photos:
             row = self._photo_row(photo, index.get(photo), number, projection)
-            sighting = shown.get(photo)
+            sighting = sighting_by_photo.get(photo)
             off = None if sighting is None else residual_of(sighting, estimate.survey.points[number], self.job)
             mark = self._shift_pixel(marks[photo]) if photo in marks else found.get(photo)
             row |= {
@@ -318,7 +319,7 @@ def helpful_order(
     """
     directions = centres - place
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-300)
-    chosen, apart = [0], np.full(len(ranks), WIDE_RAD)
+    chosen, apart = [0], np.full(len(ranks), MAX_RAY_ANGLE_RAD)
     while len(chosen) < min(len(ranks), HELPFUL_PHOTOS):
         apart = np.minimum(apart, np.arccos(np.clip(directions @ directions[chosen[-1]], -1.0, 1.0)))
         score = apart / ranks
@@ -329,8 +330,8 @@ def helpful_order(
 
 def _visible_part(line: Float64[np.ndarray, "steps 2"]) -> list[list[float]] | None:
     """The part of a line within the photo."""
-    shown = line[np.isfinite(line).all(axis=1)]
-    return np.round(shown, 1).tolist() if len(shown) > 1 else None
+    visible = line[np.isfinite(line).all(axis=1)]
+    return np.round(visible, 1).tolist() if len(visible) > 1 else None
 
 
 def _coordinates(point: SurveyedPoint) -> list[float | None]:

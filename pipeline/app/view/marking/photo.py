@@ -14,7 +14,7 @@ from PIL import Image
 from splatpipe.pipeline.photos.files.photo_list import Photo, decode, photo_bytes
 from splatpipe.pipeline.photos.files.picture_file import open_picture
 
-LARGEST_BYTES = 256 << 20
+MAX_BYTES = 256 << 20
 SOI, SOS, APP0, APP1, APP15, COMMENT, APP2, APP14 = 0xD8, 0xDA, 0xE0, 0xE1, 0xEF, 0xFE, 0xE2, 0xEE
 KEPT = (APP0, APP14)  # segments with colour information; of APP2 only the ICC profile is kept
 ICC = b"ICC_PROFILE\0"
@@ -34,7 +34,7 @@ def photo_for_browser(photo: Photo, part: Path, photos_dir: Path) -> tuple[bytes
     """
     data = photo_bytes(photo, part, photos_dir)
     try:
-        if len(data) <= LARGEST_BYTES:
+        if len(data) <= MAX_BYTES:
             with open_picture(io.BytesIO(data)) as picture:
                 plain = picture.format == "JPEG" and picture.mode in PLAIN_MODES
                 plain = plain and picture.size == (photo.width, photo.height)
