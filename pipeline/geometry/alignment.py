@@ -45,14 +45,14 @@ REFINED_HYPOTHESES = 5
 LOCAL_ROUNDS = 5
 WEAK_ROTATION_RAD = math.radians(5.0)  # a rotation known less well than this uses the prior, if there is one
 IRLS_ROUNDS = 50
-IRLS_TOLERANCE = 1e-13  # of a step, in radians and relative to the extent
+IRLS_TOLERANCE = 1e-13  # size of a step at which iterations end: radians, and relative to the extent
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
 OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors are never this large
 LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be estimated
 CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at about 1 in 10,000
 OUTLIER_SIGMAS = 3.0  # an error within the position's stated accuracy is not an outlier
-MIN_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
+MIN_NOISE_RATIO = 1e-9  # least noise as a multiple of the stated sigmas: exact data have no spread to measure
 MAX_GROUPS = 20  # groups whose own triples are tried: one good group is enough
 
 
@@ -287,7 +287,7 @@ def _reweighted(
     stated = points
     for _ in range(IRLS_ROUNDS):
         off = normed(_residuals(similarity, points.without(offsets)), points)
-        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, MIN_NOISE)
+        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, MIN_NOISE_RATIO)
         weights = _sigma_weights(points) / (1.0 + (off / (CAUCHY * noise)) ** 2)[:, None]
         points = stated.at_noise(noise)
         problem = _Problem(points, similarity)

@@ -23,7 +23,7 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 from splatpipe.pipeline.splat.quality.free_space import free_space, near_or_free, share_of_opacity
 
-LARGEST_MEGAPIXELS = 0.5  # of a depth map: floaters are larger than its pixels, and results of all sizes compare
+MAX_MEGAPIXELS = 0.5  # size of the depth maps: floaters are larger than their pixels, and results of all sizes compare
 
 
 def measure_floaters(
@@ -58,7 +58,7 @@ def measure_floaters(
         counted = [rows[counts[rows]] for rows in seen]
     pairs = neighbouring_pairs(seen)
     places = sorted({place for pair in pairs for place in pair})
-    small = {place: reduced_camera(cameras[place], LARGEST_MEGAPIXELS) for place in places}
+    small = {place: reduced_camera(cameras[place], MAX_MEGAPIXELS) for place in places}
     flagged, depths, light = _flagged(gaussians, chosen), {}, np.zeros(2)
     for place in places:
         depths[place], of_view = _depth_and_light(flagged, small[place], options)

@@ -40,9 +40,9 @@ ROW_CAPS = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05,
 # edge of a house must not outweigh all others
 STATION = 0.7  # spacing of cameras along the border, as a share of the height above the surface
 FARTHEST = 2.5  # times that height: farther rows are seen at too small an angle
-PIECE = 0.35  # of that height: minimum length of a piece of border that is judged by itself
+PIECE_LENGTH = 0.35  # least length of a piece of border that is judged by itself, over the height above the surface
 MIN_ROWS = 24  # per piece, over all images
-TILT = math.radians(45.0)  # of the oblique cameras, below the horizon
+TILT_RAD = math.radians(45.0)  # angle of the oblique cameras below the horizon
 LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks/seams.py` prints what they detect
     "alpha": (5.0, 0.002),
     "hole": (4.2, 0.15),
@@ -52,7 +52,7 @@ LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks
     "step": (5.5, 0.012),
 }
 PIECE_FACTORS = (2.2, 2.5)  # on both limits for a piece or a short border, where chance has more tries
-SHORT = 0.7  # of the height: a border of at most this length counts as a piece
+SHORT_LENGTH = 0.7  # length of a border over the height above the surface, up to which it counts as one piece
 LEVEL_COLUMNS = 32  # on each side of the border: their median depth locates a row
 
 
@@ -146,9 +146,9 @@ def border_cameras(
             along += line.length / 8.0
             continue
         heights.append(height)
-        back = math.cos(TILT) / math.sin(TILT) * height * ahead
+        back = math.cos(TILT_RAD) / math.sin(TILT_RAD) * height * ahead
         for sign in (1.0, -1.0):
-            tilted = sign * math.cos(TILT) * ahead - math.sin(TILT) * plan.up
+            tilted = sign * math.cos(TILT_RAD) * ahead - math.sin(TILT_RAD) * plan.up
             found.append(_placed(_view(middle, plan, sign * ahead, tilted), centre - sign * back))
         found.append(_placed(down, centre))
         along += STATION * height
@@ -175,7 +175,7 @@ def find_seams(
     pieces = 1 + max((response.piece for response in found), default=0)
     strongest: dict[str, tuple[float, Seam]] = {}
     for response in found:
-        part = response.piece >= 0 or line.length < SHORT * height
+        part = response.piece >= 0 or line.length < SHORT_LENGTH * height
         excess = response.excess(*(PIECE_FACTORS if part else (1.0, 1.0)))
         kind = KINDS[response.measure]
         if excess >= 1.0 and excess > strongest.get(kind, (0.0, None))[0]:
@@ -204,7 +204,7 @@ def responses(
     cameras, height = border_cameras(models[0], plan, line, like, options)
     if not cameras:
         return [], height
-    pieces = max(1, int(line.length / (PIECE * height)))
+    pieces = max(1, int(line.length / (PIECE_LENGTH * height)))
     sums: dict[tuple[int, str], Float64[np.ndarray, "p _ k"]] = {}
     counts = np.zeros(pieces + 1, np.int64)  # rows in total, and of each piece
     for camera in cameras:  # summed per image: all rows together would take hundreds of megabytes

@@ -23,7 +23,7 @@ from splatpipe.pipeline.splat.quality import metrics
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels shown as the brightest colour, in every image
 EQUAL_DB = 100.0  # stands for the infinite PSNR of identical images: JSON has no infinity
 MASKED_GREY = 128
-MIN_INSIDE = 0.01  # of an image: a photo that shows less inside a boundary is not measured
+MIN_INSIDE_SHARE = 0.01  # share of a photo inside the boundary below which it is not measured
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
@@ -53,7 +53,7 @@ def evaluate_view(
     counted = 1.0 if mask is None else round(float(mask.mean()), 6)
     facts = {"name": camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
     figures = measure(render, photo, mask)
-    if inside is not None and counted < MIN_INSIDE:
+    if inside is not None and counted < MIN_INSIDE_SHARE:
         figures = dict.fromkeys(figures)
     return facts | {"counted": counted} | figures | whole
 

@@ -34,8 +34,8 @@ POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src blob:; style-src 'self';"
     " img-src 'self' data: blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
 )
-DIGITS = 16  # of a digest, in names: enough to be unique within a site
-CORE = (0.02, 0.98)  # quantiles of the centres along each axis
+DIGEST_CHARACTERS = 16  # hexadecimal digits of a digest in names: enough to be unique within a site
+CORE_QUANTILES = (0.02, 0.98)  # quantiles of the centres along each axis
 SPZ_AXES: Axes = "y up"
 
 
@@ -121,7 +121,7 @@ def _core(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
     A node's bounding box encloses whole Gaussians: a few large, far ones in most nodes make it contain the viewpoint.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
-    core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE, axis=0)
+    core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE_QUANTILES, axis=0)
     return core
 
 
@@ -145,4 +145,4 @@ def _json(value: Mapping[str, Any] | Sequence[Any]) -> bytes:
 
 
 def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:DIGITS]
+    return hashlib.sha256(data).hexdigest()[:DIGEST_CHARACTERS]

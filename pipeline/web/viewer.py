@@ -27,8 +27,8 @@ POLICY = (
     " base-uri 'none'; form-action 'none'"
 )
 MAX_POINTS = 150_000  # in the page, 15 bytes each; more are thinned evenly
-SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis; they bound the scene
-NEARLY_ALL = 0.9  # of the points in focus: the view need not start from far away because of a few on the far side
+SIZE_QUANTILES = (0.05, 0.95)  # quantiles of the sparse points along each axis that bound the scene
+NEARLY_MOST_SHARE = 0.9  # points in focus, over the most: a few on the far side need not push the view away
 NEAR_PER_SIZE = 1e-3  # near plane as a share of the scene's size, if the caller gives none
 
 
@@ -167,7 +167,7 @@ def start_camera(scene: ViewerScene) -> int:
     if scene.focus is None or not scene.focus.any():
         return int(np.argmax([len(shown.camera.in_view(scene.points)[0]) for shown in scene.cameras]))
     seen = [shown.camera.in_view(scene.points[scene.focus])[2] for shown in scene.cameras]
-    enough = NEARLY_ALL * max(len(depths) for depths in seen)
+    enough = NEARLY_MOST_SHARE * max(len(depths) for depths in seen)
     return int(np.argmin([np.median(depths) if len(depths) >= max(enough, 1.0) else np.inf for depths in seen]))
 
 

@@ -35,7 +35,7 @@ THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows;
 MAX_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
 SKY_ROWS = 64  # twice the panorama's, so that the blur of interpolating twice is invisible
-CLEARLY_TILTED = 0.6  # of the up direction, in the image: in steep views from above, no edge is clearly the top
+MIN_UP_LENGTH = 0.6  # length of the up direction in the image: in steep views from above, no edge is clearly the top
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def upright(camera: Camera) -> tuple[Camera, int]:
         The camera of the rotated image, and the number of anticlockwise quarter turns, as for ``np.rot90``.
     """
     up_right, up_down = float(camera.cam_from_world[0, 2]), float(camera.cam_from_world[1, 2])
-    if math.hypot(up_right, up_down) < CLEARLY_TILTED:
+    if math.hypot(up_right, up_down) < MIN_UP_LENGTH:
         return camera, 0
     turns = round(math.atan2(up_right, -up_down) / (math.pi / 2.0)) % 4
     for _ in range(turns):

@@ -32,8 +32,8 @@ FAINT = 0.03  # opacity negligible where no photo shows it: seven steps of an 8-
 SOLID = 0.1  # least opacity of solid objects: haze holds nothing
 SEEN_PIXELS = 1.0  # visible pixels, over all photos, that make a Gaussian count as seen
 UNSEEN_PIXELS = 0.1
-FLOATING = 0.5  # share of a Gaussian's visible area that lies in front of everything around it
-SUSPECTED = 0.3  # the same if images decide: most of these are real, and the images keep them
+FLOATING_SHARE = 0.5  # share of a Gaussian's visible area that lies in front of everything around it
+SUSPECTED_SHARE = 0.3  # visible share in front of everything that gets tested on images: most of these are real
 FEW_PHOTOS = 2.0  # that see a loose Gaussian: training can put anything in front of a single photo
 OVERSIZED = 0.2  # times the distance to the nearest camera: a floating Gaussian's large standard deviation
 HAZE = 0.3  # opacity below which a very large Gaussian is not an object, if there are no photos to tell
@@ -104,7 +104,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
     steps = looks + (0 if photos.picture is None else LOOKS * len(photos.looked_at))
     found = measure_visibility(gaussians, photos, lambda done: on_progress(done, steps))
     seen = found.weight >= SEEN_PIXELS
-    floats = seen & (found.floating > FLOATING)
+    floats = seen & (found.floating > FLOATING_SHARE)
     ground = seen & ~floats & solid
     loose = floats & ~held(shapes, LOOSE, ground, floats & solid)
     large = floats & _oversized(shapes, photos)
@@ -115,7 +115,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
     if photos.picture is None:
         yield "floating", loose & solid & ~large  # large ones may be all that represents the far background
         return
-    suspected = seen & (found.floating > SUSPECTED) & (found.compared >= SEEN_PIXELS)
+    suspected = seen & (found.floating > SUSPECTED_SHARE) & (found.compared >= SEEN_PIXELS)
     suspects = Suspects(gaussians, shapes, suspected, seen & ~suspected & solid, found)
     floaters = likely_floaters(suspects, photos, lambda done: on_progress(looks + done, steps))
     yield "oversized", floaters & large

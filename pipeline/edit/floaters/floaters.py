@@ -34,7 +34,7 @@ worsens the photos by more than the first is left out of later passes, since it 
 that improves them by more than the second is cleared and rendered at full opacity."""
 LOOKS = len(LIMITS) + 1  # passes over all photos: likely floaters get one more, by themselves
 MIN_GAP = 0.003  # share of the depth: the accuracy of the gap
-NOISE = 1.0 / 30.0  # of one pixel's summed squared errors; it grows with the square root of the number of pixels
+PIXEL_NOISE = 1.0 / 30.0  # noise of one pixel's summed squared error (colours 0 to 1); over n pixels it grows with √n
 EVIDENCE = {
     "worse on the whole": 1.45,
     "worse in some": 1.4,
@@ -109,7 +109,7 @@ def _pixels(suspects: Suspects) -> Figures:
 def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
     """The features of the logistic regression by name, as in ``EVIDENCE``."""
     suspected, seen = suspects.suspected, suspects.sightings
-    noise = NOISE * np.sqrt(_pixels(suspects))
+    noise = PIXEL_NOISE * np.sqrt(_pixels(suspects))
     loose, light = (
         suspected & ~held(suspects.shapes, touch, suspects.ground, suspected) for touch in (LOOSE, LIGHTLY_HELD)
     )

@@ -54,12 +54,12 @@ ALL_FISHEYE = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "k4")
 FOCAL_SHARES = {"lens-file": 0.003, "xmp-dewarp": 0.01, "xmp-calibrated": 0.01, "guess": 0.3}
 OTHER_FOCAL_SHARE = 0.03
 FOCAL_SHARE = 0.03  # standard deviation of a focal length about its prior, relative, without positions
-DISTORTION_SIGMA = 0.2  # likewise of a coefficient about its estimate from SfM
+DISTORTION_SIGMA = 0.2  # standard deviation of a distortion coefficient about its estimate from SfM
 FIXED = ("k4", "k5", "k6")  # the denominator of FULL_OPENCV
 WEAK = {"k1": 0.3, "k2": 0.3, "k3": 0.3, "k4": 0.3, "p1": 0.01, "p2": 0.01, "aspect": 0.005}
-CENTRE_SHARE = 0.02  # of the width: standard deviation of a principal point
-MIN_PHOTOS = 8  # of a camera whose lens is freed
-ROUNDS = 4  # of adjustment, noise and blunders
+CENTRE_SHARE = 0.02  # standard deviation of a principal point, as a share of the image's width
+MIN_PHOTOS = 8  # photos a camera needs for its lens to be freed
+MAX_ROUNDS = 4  # rounds of adjustment, noise and blunders
 HELD_OUT = 600  # tie points that judge the lens
 CAP = 4.0  # times the median error of such a point: a wrong match must not decide
 WORSE = 0.01  # relative, of predictions by a lens that is refused
@@ -360,7 +360,7 @@ def converge(
     noise = as_stated(positions.only(kept))
     offsets = None
     adjusted = adjust_block(block, noise.observations(positions.only(kept)), offsets)
-    for done in range(ROUNDS):
+    for done in range(MAX_ROUNDS):
         poll(min(2 + done, 4), 6)
         found = np.ones(len(positions), dtype=bool)
         for part in parts_of(adjusted, positions):

@@ -31,16 +31,16 @@ MAX_CHAIN = 200  # neighbours along a flight whose drift is modelled together
 MIN_CLASS = 10  # positions with a factor of their own
 PRIOR_DEGREES = 2.0  # weight of the stated standard deviation, for few positions
 LITTLE = 0.2  # its weight for many
-FEW_DEGREES = 10.0  # of freedom: fewer do not tell a factor, and the other direction's counts
+FEW_DEGREES = 10.0  # degrees of freedom below which a direction's factor is uncertain, and the other direction's counts
 FACTOR_ROUNDS = 12
 SETTLED = 0.01  # relative, of a factor
 MIN_FACTOR = 0.05
 ROBUST_ROUNDS = 30
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
-MEDIAN_NORM = 1.538  # of three standard normal coordinates
+MEDIAN_NORM = 1.538  # median norm of three standard normal coordinates
 BLUNDER_NOISES = 6.0  # times the noise of its class, as its root mean square along the axes
 BLUNDER_STATED = 3.0  # times the stated standard deviation: a smaller error is not a blunder
-SHARED = 0.7  # of a stated standard deviation: the part common to a flight (base, troposphere, antenna)
+SHARED_PART = 0.7  # part of a stated standard deviation common to a flight (base, troposphere, antenna)
 
 
 @dataclass(frozen=True)
@@ -132,8 +132,8 @@ class PositionNoise:
         groups = len(positions.apart)
         typical = np.array([np.median(positions.sigmas[positions.group == g], axis=0) for g in range(groups)])
         mean = np.array([self.factors[self.of[positions.group == g]].mean(axis=0)[[0, 0, 1]] for g in range(groups)])
-        hidden = typical * np.sqrt(np.maximum(1.0 - mean**2, SHARED**2))
-        return np.where(positions.apart, unbound, np.maximum(hidden, SHARED * typical * np.maximum(mean, 1.0)))
+        hidden = typical * np.sqrt(np.maximum(1.0 - mean**2, SHARED_PART**2))
+        return np.where(positions.apart, unbound, np.maximum(hidden, SHARED_PART * typical * np.maximum(mean, 1.0)))
 
     def observations(self, positions: StatedPositions, unbound: float = 1e4) -> PositionObservations:
         """The positions as an adjustment takes them."""

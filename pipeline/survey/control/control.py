@@ -73,7 +73,7 @@ SUSPICIOUS = 1.0  # noise over sigmas; sound control with realistic sigmas stays
 SINGLE_BLUNDER_GAIN = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
 MANY_OFF_SIGMAS = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
 SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
-ROUNDS = 4  # of adjustment, each without a blunder found in the one before, or with larger sigmas
+MAX_ROUNDS = 4  # adjustments, each without a blunder found in the one before, or with larger sigmas
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class _TrustedAdjustment:
 def _settle(case: _Case, report: Reporter) -> _TrustedAdjustment:
     """Adjust until the control agrees, leaving out single blunders or else enlarging the sigmas."""
     best = _try(case.result.survey, 1.0, case)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         better = _without_one(best, case) if best.noise > SUSPICIOUS else None
         if better is None:
             if best.noise <= QUIET:

@@ -17,8 +17,8 @@ from splatpipe.pipeline.survey.files.survey_text import (
     ELLIPSOIDAL_Z,
     GEOGRAPHIC,
     GEOGRAPHIC_Y,
-    LOOKED_AT,
     MAX_LINE_CHARS,
+    SAMPLE_LINES,
     SEPARATORS,
     UNKNOWN,
     LineError,
@@ -88,7 +88,7 @@ ROLES: Mapping[str, Role] = {
     "cp": "check",
     "check point": "check",
     "control point": "control",
-    "3d gcp": "control",  # of Pix4D
+    "3d gcp": "control",  # as Pix4D calls it
 }
 
 
@@ -298,7 +298,7 @@ def _require_no_points(written: Sequence[tuple[int, str]]) -> None:
         LineError: if the lines are such points.
     """
     for separator in filter(None, SEPARATORS):
-        looked = [list_fields(line, separator, TABS) for _, line in written[:LOOKED_AT]]
+        looked = [list_fields(line, separator, TABS) for _, line in written[:SAMPLE_LINES]]
         points = [each for each in looked if len(each) >= 4 and all(map(is_numeral, each[1:4]))]
         if points and 2 * len(points) >= len(looked) and not any(is_photo(PurePosixPath(cell)) for cell in points[0]):
             what = f"points separated by {SEPARATORS[separator]} without titles"

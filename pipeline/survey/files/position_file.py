@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.files.survey_text import (
     ELLIPSOIDAL_Z,
     GEOGRAPHIC,
     GEOGRAPHIC_Y,
-    MOST_WORDS,
+    MAX_NAME_WORDS,
     SEPARATORS,
     UNKNOWN,
     LineError,
@@ -173,7 +173,7 @@ def _fields(line: str, separator: str, find: NameFinder | None) -> list[str]:
     whole = with_whole_name(fields, 0)
     if len(whole) < len(fields) or is_photo(PurePosixPath(fields[0])):
         return whole
-    for end in range(min(len(fields) - 2, MOST_WORDS)):  # a name without a suffix
+    for end in range(min(len(fields) - 2, MAX_NAME_WORDS)):  # a name without a suffix
         name = " ".join(fields[: end + 1])
         is_place = all(map(is_numeral, fields[end + 1 : end + 3]))
         if is_place and (find is None or find(name) is not None):

@@ -13,8 +13,8 @@ from splatpipe.pipeline.geometry.similarity import similarity_jacobian
 from splatpipe.pipeline.survey.placing.receiver_noise import NoisyFit, ReceiverNoise
 
 NORMAL_95 = 1.959964
-MIN_DEGREES = 3.0  # of freedom that intervals count on: of strongly correlated errors, effective ones run out
-MAX_PLACES = 2000  # of the model where the accuracy of its coordinates is evaluated
+MIN_DEGREES = 3.0  # least degrees of freedom for intervals: with strong correlations, effective ones run out
+MAX_PLACES = 2000  # places in the model where the accuracy of its coordinates is evaluated
 DIGITS = 6
 
 

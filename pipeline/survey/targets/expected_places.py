@@ -24,7 +24,7 @@ MIN_RADIUS_M = 8.0  # consumer receivers share an error of several metres, whate
 RADIUS_SIGMAS = 4.0
 NEAR_M = 15.0  # radius around a point in which sparse points give the ground's height
 MIN_NEAR = 5
-WHOLE = 0.6  # of a photo's area: a larger window becomes the whole photo
+WHOLE_PHOTO_SHARE = 0.6  # share of a photo's area above which a window becomes the whole photo
 
 
 def expected_windows(
@@ -125,6 +125,6 @@ def _window(
         return None
     left, top = np.floor(low[shown].min(axis=0)).astype(int).tolist()
     right, bottom = np.ceil(high[shown].max(axis=0)).astype(int).tolist()
-    if (right - left) * (bottom - top) > WHOLE * photo.width * photo.height:
+    if (right - left) * (bottom - top) > WHOLE_PHOTO_SHARE * photo.width * photo.height:
         return 0, 0, photo.width, photo.height
     return left, top, right, bottom

@@ -18,7 +18,7 @@ MIN_TOLERANCE_PX = 3.0
 FIT_TOLERANCE = 4.0  # times the model's mean reprojection error
 MIN_UNNAMED = 3  # photos of a target without a number: two rays can meet by chance
 MIN_CODED = 2
-MAX_PARTNERS = 40  # of a detection that are tried as hypotheses
+MAX_PARTNERS = 40  # partners of a detection that are tried as hypotheses
 MAX_SEEDS = 4000
 BEYOND = 2.0  # factor by which a target may be farther or nearer than the sparse points in a photo
 

@@ -223,7 +223,7 @@ def look(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 GROUND = np.random.default_rng(4).uniform(-30, 30, (400, 3)) * [1.0, 1.0, 0.001]
-TURN = rotation_from_vector(np.array([0.9, -0.4, 1.3]))  # of the model against the world
+TURN = rotation_from_vector(np.array([0.9, -0.4, 1.3]))  # rotation of the model against the world
 
 
 def estimate(

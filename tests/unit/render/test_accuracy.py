@@ -25,7 +25,7 @@ from splatpipe.pipeline.survey.crs.frames import Frame, save_frame
 from splatpipe.pipeline.survey.crs.geodesy import Origin
 from splatpipe.stages import evaluate
 
-TURN = rotation_from_vector(np.array([0.25, -0.2, 0.1]))  # of the wall, in the model's frame: seen at a slant
+TURN = rotation_from_vector(np.array([0.25, -0.2, 0.1]))  # rotation of the wall in the model's frame: seen at a slant
 WORLD_FROM_MODEL = Similarity(12.5, rotation_from_vector(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
 RENDERED = 6e-3  # metres; a pixel is 0.089. The screen filter makes slanted surfaces appear a little nearer
 

@@ -79,7 +79,7 @@ def test_only_as_many_views_as_asked_are_judged_and_their_figures_are_the_same(
     few, every = (json.loads((folder / "metrics.json").read_text()) for folder in (tmp_path, left))
     assert (few["test_views"], few["held_out_views"]) == (2, 3) == (summary["test_views"], summary["held_out_views"])
     assert every["held_out_views"] == 3
-    assert few["per_view"] == [every["per_view"][0], every["per_view"][2]]  # of three
+    assert few["per_view"] == [every["per_view"][0], every["per_view"][2]]  # the second is not judged
     assert few["floaters"]["veil"]["photos"] == 2 and len(list((tmp_path / "views").glob("*.render.png"))) == 2
 
 
