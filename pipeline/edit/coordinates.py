@@ -78,7 +78,7 @@ class Coordinates:
         found = self.world.local_from_crs(points)
         if not (np.isfinite(found).all() and (np.abs(found) <= MAX_COORDINATE).all()):
             raise UsageError(
-                f"{self.name} has no place for {_shown(points[~np.isfinite(found).all(axis=1)])}.",
+                f"{self.name} has no place for {_coordinates_text(points[~np.isfinite(found).all(axis=1)])}.",
                 hint="East (or longitude) comes first. With --local, numbers are metres from the splat's origin.",
             )
         return found
@@ -109,5 +109,5 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _shown(points: Float64[np.ndarray, "n 3"]) -> str:
+def _coordinates_text(points: Float64[np.ndarray, "n 3"]) -> str:
     return ",".join(f"{number:g}" for number in (points[0] if len(points) else np.zeros(0)))

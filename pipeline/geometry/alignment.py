@@ -196,8 +196,8 @@ def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tupl
         used = int(fit.inliers.sum())
         degrees = max(1, 3 * used - SIMILARITY)
         spread = math.sqrt(3.0 * float((normed(fit.residuals, points)[fit.inliers] ** 2).sum()) / degrees)
-        settled = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
-        if settled or used == len(points) or limit.most > widest:
+        is_consistent = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
+        if is_consistent or used == len(points) or limit.most > widest:
             return fit, limit
         limit = InlierLimit(LIMIT_STEP * limit.most, of_sigmas=True)
 
@@ -221,11 +221,11 @@ def _consensus(points: Correspondences, limit: InlierLimit, hypotheses: list[Sim
         for _ in range(LOCAL_ROUNDS):
             if cost < best_cost:
                 best_cost, best = cost, candidate
-            settled = points.without(_median_offsets(candidate, points))
-            near = limit.near(_residuals(candidate, settled), points)
+            without_offsets = points.without(_median_offsets(candidate, points))
+            near = limit.near(_residuals(candidate, without_offsets), points)
             if near.sum() < 3:
                 break
-            candidate = _closed_form(settled.only(near), weights[near])
+            candidate = _closed_form(without_offsets.only(near), weights[near])
             cost = float(_costs(points, limit, [candidate])[0])
     return best
 
@@ -248,8 +248,8 @@ def _refine(
 ) -> SimilarityFit:
     """Reweighted least squares on the points near the fit, until the inliers no longer change."""
     similarity = start
-    settled = points.without(_median_offsets(start, points))
-    inliers = limit.near(_residuals(start, settled), points)
+    without_offsets = points.without(_median_offsets(start, points))
+    inliers = limit.near(_residuals(start, without_offsets), points)
     if inliers.sum() < 3:
         inliers = np.ones(len(points), dtype=bool)
     near, noise, offsets = inliers, 1.0, np.zeros((0, 3))

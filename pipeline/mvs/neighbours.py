@@ -76,8 +76,8 @@ def neighbours(tracks: SparseVisibility, cameras: Sequence[Camera], most: int) -
         shared = np.bincount(others, minlength=len(cameras))
         score = np.where(shared >= MIN_SHARED, np.bincount(others, weights, minlength=len(cameras)), 0.0)
         score[view] = 0.0
-        ranked = np.argsort(-score, kind="stable")[:most]
-        found.append([int(other) for other in ranked if score[other] > 0.0])
+        by_score = np.argsort(-score, kind="stable")[:most]
+        found.append([int(other) for other in by_score if score[other] > 0.0])
     return found
 
 

@@ -51,11 +51,11 @@ def measure_floaters(
     seen = [tracks[camera.name] for camera in cameras]
     space = free_space(cameras, points.xyz, seen)
     chosen = near_or_free(gaussians, space)
-    floating, counted = share_of_opacity(gaussians, chosen), seen
+    floating, inside_seen = share_of_opacity(gaussians, chosen), seen
     if area is not None:
         inside, counts = _inside(area, gaussians), area.contains(points.xyz)
         floating, chosen = share_of_opacity(gaussians.select(inside), chosen[inside]), chosen & inside
-        counted = [rows[counts[rows]] for rows in seen]
+        inside_seen = [rows[counts[rows]] for rows in seen]
     pairs = neighbouring_pairs(seen)
     places = sorted({place for pair in pairs for place in pair})
     small = {place: reduced_camera(cameras[place], MAX_MEGAPIXELS) for place in places}
@@ -66,7 +66,7 @@ def measure_floaters(
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
     apart = depth_disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
     return {
-        "veil": measure_blocked_light(gaussians, cameras, (points.xyz, counted), held_out, options),
+        "veil": measure_blocked_light(gaussians, cameras, (points.xyz, inside_seen), held_out, options),
         "free_space_opacity": _rounded(floating) if space.known else None,
         "free_space_gaussians": int(chosen.sum()) if space.known else None,
         "free_space_rendered": _rounded(light[0] / light[1]) if space.known and light[1] > 0.0 else None,

@@ -217,11 +217,11 @@ def responses(
             for name, values in _measured(rows.channels, width).items():
                 added = np.stack([values[:, part].sum(axis=1) for part in chosen])
                 sums[width, name] = sums.get((width, name), 0.0) + added
-    shown = np.flatnonzero(counts >= MIN_ROWS).tolist()
+    judged = np.flatnonzero(counts >= MIN_ROWS).tolist()
     found = [
         _response(total[piece] / counts[piece], (name, piece - 1, width), int(counts[piece]))
         for (width, name), total in sums.items()
-        for piece in shown
+        for piece in judged
     ]
     return found, height
 
@@ -271,16 +271,16 @@ def _rows(
     reach = stacks[0].shape[2] // 2
     about = stacks[0][1][:, reach - LEVEL_COLUMNS : reach + LEVEL_COLUMNS]
     about = np.where(about > 0.0, about, np.nan)
-    shown = np.flatnonzero(np.isfinite(about).any(axis=1))
-    level = np.nanmedian(about[shown], axis=1)
-    pixels = np.column_stack([np.full(len(shown), camera.cx), shown + 0.5])
+    image_rows = np.flatnonzero(np.isfinite(about).any(axis=1))
+    level = np.nanmedian(about[image_rows], axis=1)
+    pixels = np.column_stack([np.full(len(image_rows), camera.cx), image_rows + 0.5])
     along = line.along(plan.places(camera.unproject(pixels, level)))
     inside = (along >= 0.0) & (along <= line.length) & (level <= FARTHEST * height)
-    shown, level, along = shown[inside], level[inside], along[inside]
+    image_rows, level, along = image_rows[inside], level[inside], along[inside]
     pixel = (level / camera.fx)[:, None]
-    channels = np.zeros((6, len(shown), 2 * reach))
+    channels = np.zeros((6, len(image_rows), 2 * reach))
     for sign, stack in zip((1.0, -1.0), stacks, strict=True):
-        part = stack[:, shown]
+        part = stack[:, image_rows]
         part[1] = np.where(part[1] > 0.0, part[1] - level[:, None], 0.0) / pixel
         part[2] /= pixel
         channels += sign * part

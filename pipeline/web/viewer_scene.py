@@ -63,7 +63,7 @@ def viewer_rendering(options: RenderOptions, sky: Panorama | None) -> ViewerRend
 def viewer_scene(
     dataset: Path,
     frame: Frame,
-    look: ViewerRendering,
+    rendering: ViewerRendering,
     held_out: Collection[str] = (),
     gaussians: int = 0,
     title: str = "3D model",
@@ -84,10 +84,10 @@ def viewer_scene(
     views, points = load_views(dataset), load_points(dataset)
     in_world = frame.world_from_model.apply(points.xyz)
     height = THUMB_HEIGHT if len(views) <= MAX_LARGE_THUMBS else SMALL_THUMB_HEIGHT
-    cameras = tuple(_shown(view, frame, height, view.camera.name in held_out) for view in views)
+    cameras = tuple(_viewer_camera(view, frame, height, view.camera.name in held_out) for view in views)
     crs = None
     if frame.origin is not None:
-        centres = np.array([shown.camera.centre() for shown in cameras]).reshape(-1, 3)
+        centres = np.array([viewer_camera.camera.centre() for viewer_camera in cameras]).reshape(-1, 3)
         crs = local_crs(open_world(frame), scene_box(in_world, centres))
     return ViewerScene(
         title=title,
@@ -98,10 +98,10 @@ def viewer_scene(
         metres=frame.in_metres,
         placed=frame.origin is not None,
         crs=crs,
-        antialias=look.antialias,
-        background=look.background,
-        near=look.near * float(frame.world_from_model.scale),
-        sky=None if look.sky is None else _sky(look.sky, frame),
+        antialias=rendering.antialias,
+        background=rendering.background,
+        near=rendering.near * float(frame.world_from_model.scale),
+        sky=None if rendering.sky is None else _sky(rendering.sky, frame),
         note=frame.note,
     )
 
@@ -164,7 +164,7 @@ def _quarter(camera: Camera) -> Camera:
     )
 
 
-def _shown(view: View, frame: Frame, height: int, held_out: bool) -> ViewerCamera:
+def _viewer_camera(view: View, frame: Frame, height: int, held_out: bool) -> ViewerCamera:
     camera, turns = upright(_in_world(view.camera, frame))
     size = (view.camera.width, view.camera.height)
     picture = np.rot90(read_small(view.image_path, size, (height, height))[1], turns)

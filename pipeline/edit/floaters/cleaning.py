@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from splatpipe.pipeline.edit.floaters.floaters import LOOKS, LOOSE, Suspects, likely_floaters
+from splatpipe.pipeline.edit.floaters.floaters import LOOSE, PASSES, Suspects, likely_floaters
 from splatpipe.pipeline.edit.floaters.isolation import GaussianShapes, far_groups, held
 from splatpipe.pipeline.edit.floaters.visibility import GaussianVisibility, TrainingPhotos, measure_visibility
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
@@ -100,8 +100,8 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
         yield "oversized", _haze(shapes, opacity)
         yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
         return
-    looks = len(photos.cameras)
-    steps = looks + (0 if photos.picture is None else LOOKS * len(photos.looked_at))
+    photo_count = len(photos.cameras)
+    steps = photo_count + (0 if photos.picture is None else PASSES * len(photos.compared_photos))
     found = measure_visibility(gaussians, photos, lambda done: on_progress(done, steps))
     seen = found.weight >= SEEN_PIXELS
     floats = seen & (found.floating > FLOATING_SHARE)
@@ -117,7 +117,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
         return
     suspected = seen & (found.floating > SUSPECTED_SHARE) & (found.compared >= SEEN_PIXELS)
     suspects = Suspects(gaussians, shapes, suspected, seen & ~suspected & solid, found)
-    floaters = likely_floaters(suspects, photos, lambda done: on_progress(looks + done, steps))
+    floaters = likely_floaters(suspects, photos, lambda done: on_progress(photo_count + done, steps))
     yield "oversized", floaters & large
     yield "floating", floaters
     on_progress(steps, steps)

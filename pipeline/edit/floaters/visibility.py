@@ -51,7 +51,7 @@ class TrainingPhotos:
     compared: Sequence[int] | None = None
 
     @property
-    def looked_at(self) -> Sequence[int]:
+    def compared_photos(self) -> Sequence[int]:
         """Indices of the photos that suspects are compared with."""
         return range(len(self.cameras)) if self.compared is None else self.compared
 
@@ -112,7 +112,7 @@ def measure_visibility(
     grey = grey_of(gaussians)
     plain = replace(photos.options, sh_degree=0, depth=True, magnitudes=False)
     centres, axes = gaussians.means.detach().numpy(force=True), half_axes(gaussians)
-    sums, looked_at = _VisibilitySums(len(gaussians)), set(photos.looked_at)
+    sums, compared_indices = _VisibilitySums(len(gaussians)), set(photos.compared_photos)
     for index, camera in enumerate(photos.cameras):
         rendered = rasterizer.render(grey, camera, plain)
         behind = without_islands(rendered.median_depth.numpy(force=True))
@@ -120,7 +120,7 @@ def measure_visibility(
         found = weights_of(rendered, grey, picture)
         rows = np.flatnonzero(found[:, 0] > MIN_VISIBLE_PX)
         _add(sums, rows, found[rows], camera, (centres[rows], axes[rows]))
-        if index in looked_at:
+        if index in compared_indices:
             sums.compared[rows] += found[rows, 0]
         on_progress(index + 1)
     return sums.sightings()

@@ -252,7 +252,7 @@ def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) ->
         if not seen:
             continue
         camera, pose = before.cameras[image.camera_id], image.cam_from_world().matrix()
-        shown = [project_through_lens(camera, pose, xyz[seen])[0] for xyz in (old, back)]
-        squares.append(((shown[1] - shown[0]) ** 2).sum(axis=1))
+        projected = [project_through_lens(camera, pose, xyz[seen])[0] for xyz in (old, back)]
+        squares.append(((projected[1] - projected[0]) ** 2).sum(axis=1))
     together = np.concatenate(squares)
     return float(np.sqrt(together[np.isfinite(together)].mean()))

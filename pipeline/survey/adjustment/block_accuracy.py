@@ -175,8 +175,8 @@ def with_control(accuracy: BlockAccuracy, counts: Sequence[int] = (1, 3)) -> dic
         spread = np.einsum("kaq,kbq->kab", carried, accuracy.carry, optimize=True) + survey
         crossed = carried @ mean  # (k, 3)
         gains = np.einsum("ka,ka->k", crossed, np.linalg.solve(spread, crossed[:, :, None])[:, :, 0])
-        ranked = gains - 1e9 * np.array([tuple(place) in places for place in accuracy.places.tolist()])
-        best = int(np.argmax(ranked)) if count == 1 else _farthest(accuracy, ranked, places)
+        scores = gains - 1e9 * np.array([tuple(place) in places for place in accuracy.places.tolist()])
+        best = int(np.argmax(scores)) if count == 1 else _farthest(accuracy, scores, places)
         places.append(tuple(accuracy.places[best].tolist()))
         covariance = covariance - carried[best].T @ np.linalg.solve(spread[best], carried[best])
         if count in counts:
@@ -185,11 +185,11 @@ def with_control(accuracy: BlockAccuracy, counts: Sequence[int] = (1, 3)) -> dic
 
 
 def _farthest(
-    accuracy: BlockAccuracy, ranked: Float64[np.ndarray, " k"], places: Sequence[tuple[float, float, float]]
+    accuracy: BlockAccuracy, scores: Float64[np.ndarray, " k"], places: Sequence[tuple[float, float, float]]
 ) -> int:
     """Of the points, the one farthest from those chosen: control belongs around the site."""
     away = np.min([np.linalg.norm(accuracy.places[:, :2] - np.array(place)[:2], axis=1) for place in places], axis=0)
-    return int(np.argmax(np.where(ranked > -1e8, away, -1.0)))
+    return int(np.argmax(np.where(scores > -1e8, away, -1.0)))
 
 
 def with_cross_strip(accuracy: BlockAccuracy) -> Remedy | None:
@@ -247,15 +247,15 @@ def _with_strip(block: Block) -> Block | None:
     for k, centre in enumerate(centres):
         rays = (block.points - centre) @ rotation.T
         ahead = rays[:, 2] > 0.1
-        shown = np.full((len(rays), 2), np.nan)
-        shown[ahead] = np.asarray(lens.camera.img_from_cam(rays[ahead]), np.float64)
+        projected = np.full((len(rays), 2), np.nan)
+        projected[ahead] = np.asarray(lens.camera.img_from_cam(rays[ahead]), np.float64)
         size = np.array([lens.camera.width, lens.camera.height])
         slope = np.hypot(rays[:, 0], rays[:, 1]) < 1.5 * np.maximum(rays[:, 2], 1e-9)
-        inside = ((shown > 0.0) & (shown < size)).all(axis=1) & slope
+        inside = ((projected > 0.0) & (projected < size)).all(axis=1) & slope
         seen = np.flatnonzero(inside)
         photo.append(np.full(len(seen), len(block) + k))
         point.append(seen)
-        pixels.append(shown[seen])
+        pixels.append(projected[seen])
     order = np.argsort(np.concatenate([block.point, *point]), kind="stable")
     added = sum(map(len, point))
     return replace(

@@ -27,8 +27,8 @@ from splatpipe.pipeline.survey.adjustment.position_noise import (
     centre_system,
     estimate_noise,
     find_blunders,
+    noise_with_drift,
     predicted_errors,
-    settled_noise,
     strip_pieces,
     with_drift_of,
 )
@@ -63,7 +63,7 @@ MAX_ROUNDS = 4  # rounds of adjustment, noise and blunders
 HELD_OUT = 600  # tie points that judge the lens
 CAP = 4.0  # times the median error of such a point: a wrong match must not decide
 WORSE = 0.01  # relative, of predictions by a lens that is refused
-SETTLED = 0.03  # relative change of the noise
+MIN_RELATIVE_CHANGE = 0.03  # relative change of the noise
 
 
 def quietly(done: int, total: int) -> None:
@@ -372,7 +372,7 @@ def converge(
         before, noise = noise, _noise_of(adjusted, used)
         adjusted = adjust_block(adjusted.block, noise.observations(used), adjusted.offsets)
         same = before.factors.shape == noise.factors.shape and len(before.of) == len(noise.of)
-        if same and np.abs(before.factors / noise.factors - 1.0).max() < SETTLED:
+        if same and np.abs(before.factors / noise.factors - 1.0).max() < MIN_RELATIVE_CHANGE:
             break
     return BlockFit(adjusted, positions, kept, noise)
 
@@ -387,7 +387,7 @@ def _noise_of(adjusted: AdjustedBlock, positions: StatedPositions) -> PositionNo
     every = as_stated(positions)
     factors, weights = np.zeros_like(every.factors), np.zeros(len(every.classes))
     for part in parts:
-        found = noise if part is middle else settled_noise(part.system, part.block, part.positions, noise)
+        found = noise if part is middle else noise_with_drift(part.system, part.block, part.positions, noise)
         for own, name in enumerate(found.classes):
             at = every.classes.index(name) if name in every.classes else len(every.classes) - 1
             count = float((found.of == own).sum())

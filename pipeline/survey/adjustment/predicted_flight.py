@@ -328,8 +328,8 @@ def _part(flight: _Flight) -> Int64[np.ndarray, " k"]:
 def _synthetic_block(flight: _Flight) -> Block | None:
     """The block of a flight with tie points on the ground; None where photos do not overlap."""
     points = _draw_points(flight)
-    shown = [_pixels(flight, k, points) for k in range(len(flight.positions))]
-    seen = np.stack([np.isfinite(each[:, 0]) for each in shown], axis=1)  # (p, n)
+    projected = [_pixels(flight, k, points) for k in range(len(flight.positions))]
+    seen = np.stack([np.isfinite(each[:, 0]) for each in projected], axis=1)  # (p, n)
     chosen = np.flatnonzero(seen.sum(axis=1) >= MIN_VIEWS)
     wanted = PER_PHOTO * len(flight.positions) / max(int(seen[chosen].sum()), 1)
     chosen = chosen[np.random.default_rng(SEED).permutation(len(chosen))[: round(wanted * len(chosen))]]
@@ -337,7 +337,7 @@ def _synthetic_block(flight: _Flight) -> Block | None:
         return None
     seen = seen[chosen]
     point, photo = (each.astype(np.int64) for each in np.nonzero(seen))
-    pixels = np.stack([each[chosen] for each in shown], axis=1)[seen]
+    pixels = np.stack([each[chosen] for each in projected], axis=1)[seen]
     kinds = tuple(dict.fromkeys(flight.cameras))
     place = points[chosen]
     return Block(

@@ -274,8 +274,8 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row], str]:
     for number, line in written[1:]:
         fields = fields_of(line, separator)
         if len(fields) < 6:
-            counted = f"{len(fields)} field{'' if len(fields) == 1 else 's'} separated by {SEPARATORS[separator]}"
-            raise LineError(number, f"{counted}, but at least 6 are needed: x y z pixel_x pixel_y photo")
+            field_count = f"{len(fields)} field{'' if len(fields) == 1 else 's'} separated by {SEPARATORS[separator]}"
+            raise LineError(number, f"{field_count}, but at least 6 are needed: x y z pixel_x pixel_y photo")
         place = (number_in(number, "x", fields[0]), number_in(number, "y", fields[1]), _height(number, fields[2]))
         mark = Mark(
             _name(number, fields[5]), number_in(number, "pixel x", fields[3]), number_in(number, "pixel y", fields[4])

@@ -157,7 +157,7 @@ def _odm_rows(
     for number, line in written[1:]:
         fields = _fields(line, separator, find)
         if len(fields) < 3:
-            raise LineError(number, f"{_counted(len(fields), separator)}, but at least 3 are needed: photo x y")
+            raise LineError(number, f"{_field_count(len(fields), separator)}, but at least 3 are needed: photo x y")
         row = dict(zip(ODM_ORDER, fields, strict=False))
         if len(fields) < ANGLES_FROM:
             row = {key: row[key] for key in ("name", "x", "y", "z") if key in row}
@@ -181,7 +181,7 @@ def _fields(line: str, separator: str, find: NameFinder | None) -> list[str]:
     return fields
 
 
-def _counted(count: int, separator: str) -> str:
+def _field_count(count: int, separator: str) -> str:
     return f"{count} field{'' if count == 1 else 's'} separated by {SEPARATORS[separator]}"
 
 

@@ -107,7 +107,7 @@ def report_contradictions(placed: Placed, report: Reporter) -> list[Contradictio
     """
     if placed.frame.origin is None:
         return []
-    found = [each for look in LOOKS for each in look(placed)]
+    found = [each for check in CHECKS for each in check(placed)]
     for each in found:
         report.warning(each.text, each.hint)
     return found
@@ -168,9 +168,9 @@ def _climbs(placed: Placed) -> Iterator[Contradiction]:
             "Check the scale of the result on a known length, and the positions' altitudes.",
         )
     if placed.controlled is None:  # else heights are the control's
-        told = altitude_climbs([placed.positions.by_name.get(name, {}) for name in placed.model.names])
-        if told is not None:
-            yield Contradiction(*told)
+        contradiction = altitude_climbs([placed.positions.by_name.get(name, {}) for name in placed.model.names])
+        if contradiction is not None:
+            yield Contradiction(*contradiction)
 
 
 def _speed(placed: Placed) -> Iterator[Contradiction]:
@@ -347,7 +347,7 @@ def _shape(ours: Similarity, alone: Frame, name: str) -> Iterator[Contradiction]
         )
 
 
-LOOKS: tuple[Callable[[Placed], Iterator[Contradiction]], ...] = (
+CHECKS: tuple[Callable[[Placed], Iterator[Contradiction]], ...] = (
     _up,
     _north,
     _control,

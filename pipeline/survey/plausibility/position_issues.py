@@ -242,10 +242,10 @@ def _headings(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[C
 def _contradicting(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
     """Photos whose EXIF and XMP state different positions, where most photos' agree."""
     apart: dict[str, float] = {}
-    settled = positions.doubts.frozen | positions.doubts.by_xmp
+    resolved = positions.doubts.frozen | positions.doubts.by_xmp
     for photo in photos:
         gps, other = photo.exif.gps, xmp_place(photo.xmp)
-        if photo.name in settled or gps is None or other is None or not is_on_earth(gps.latitude, gps.longitude):
+        if photo.name in resolved or gps is None or other is None or not is_on_earth(gps.latitude, gps.longitude):
             continue
         if is_on_earth(other.latitude, other.longitude):
             places = [(gps.latitude, gps.longitude)], [(other.latitude, other.longitude)]

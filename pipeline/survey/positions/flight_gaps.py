@@ -67,14 +67,14 @@ def find_missing(names: Sequence[str], flight: PositionEvidence) -> list[Missing
         skipped = 0
         if numbers is not None:
             skipped = numbers[int(order[k + 1])] - numbers[int(order[k])] - 1
-        counted = MIN_NUMBERS <= skipped <= FURTHEST_MISSING
-        missing = skipped if counted else round(float(pauses[k]) / pause) - 1
-        is_gap = counted and pauses[k] > BY_NUMBER_PAUSE * pause
+        by_number = MIN_NUMBERS <= skipped <= FURTHEST_MISSING
+        missing = skipped if by_number else round(float(pauses[k]) / pause) - 1
+        is_gap = by_number and pauses[k] > BY_NUMBER_PAUSE * pause
         leads_on = _goes_on(way, k, usual) or steps[k] > max(LONG_STEP * usual, LONGEST_TURN * _other_turns(steps, k))
         is_gap |= leads_on and _as_fast(steps[k] / pauses[k], usual / pause, pauses[k] / pause)
         if is_gap and 2 <= missing <= FURTHEST_MISSING:
             pair = int(order[k]), int(order[k + 1])
-            found.append(MissingStrip(*pair, int(missing), float(steps[k]), usual, counted))
+            found.append(MissingStrip(*pair, int(missing), float(steps[k]), usual, by_number))
     return found
 
 

@@ -67,7 +67,7 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
     vague = {each.name for each in photos if _is_usable(each.exif.gps) and not _of(each).hemispheres}
     by_xmp = {name for name in vague if _is_usable(xmp_place(by_name[name].xmp))}
     zero, sign, above_takeoff = _zero(photos), _wrong_sign(photos), _above_takeoff(photos)
-    settled = []
+    corrected = []
     for photo in photos:
         gps = photo.exif.gps
         if gps is not None:
@@ -79,7 +79,7 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
             if name in frozen | by_xmp:
                 gps = replace(gps, void=True)
             photo = replace(photo, exif=replace(photo.exif, gps=gps))
-        settled.append(photo)
+        corrected.append(photo)
     doubts = SourceDoubts(
         frozenset(frozen),
         frozenset(vague - by_xmp),
@@ -87,10 +87,10 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
         frozenset(sign),
         frozenset(above_takeoff),
         frozenset(zero),
-        {each.name: _of(each).datum for each in settled if _is_usable(each.exif.gps) and _of(each).datum},
-        _impossible(settled),
+        {each.name: _of(each).datum for each in corrected if _is_usable(each.exif.gps) and _of(each).datum},
+        _impossible(corrected),
     )
-    return settled, doubts
+    return corrected, doubts
 
 
 def stated_places(photos: Sequence[CheckedPhoto]) -> dict[str, tuple[float, float]]:

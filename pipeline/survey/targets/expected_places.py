@@ -120,11 +120,11 @@ def _window(
     pixels = middle + focal * seen[:, :2] / seen[:, 2:]
     low, high = np.maximum(pixels - reach[:, None], 0.0), pixels + reach[:, None]
     high = np.minimum(high, [photo.width, photo.height])
-    shown = (high - low > 1.0).all(axis=1)
-    if not shown.any():
+    visible = (high - low > 1.0).all(axis=1)
+    if not visible.any():
         return None
-    left, top = np.floor(low[shown].min(axis=0)).astype(int).tolist()
-    right, bottom = np.ceil(high[shown].max(axis=0)).astype(int).tolist()
+    left, top = np.floor(low[visible].min(axis=0)).astype(int).tolist()
+    right, bottom = np.ceil(high[visible].max(axis=0)).astype(int).tolist()
     if (right - left) * (bottom - top) > WHOLE_PHOTO_SHARE * photo.width * photo.height:
         return 0, 0, photo.width, photo.height
     return left, top, right, bottom
