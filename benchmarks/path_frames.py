@@ -45,7 +45,7 @@ from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks
 from splatpipe.pipeline.photos.pixels.images import Pixels
 from splatpipe.pipeline.raster.device import cpu
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.render.consistency import AGREEMENT
+from splatpipe.pipeline.render.consistency import DEPTH_TOLERANCE
 
 LUMA = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601, of coded values
 EVERY_PX = 3  # spacing of the pixels that are followed into the next frame, both ways
@@ -97,7 +97,7 @@ def same_places(
     inside = ((there >= 1.0) & (there <= [following.width - 1.0, following.height - 1.0])).all(axis=1)
     here, there, ahead = here[inside], there[inside], ahead[inside]
     column, row = there.astype(np.int64).T
-    agree = np.abs(following_depth[row, column] / ahead - 1.0) < AGREEMENT
+    agree = np.abs(following_depth[row, column] / ahead - 1.0) < DEPTH_TOLERANCE
     return here[agree], there[agree]
 
 

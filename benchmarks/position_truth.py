@@ -156,7 +156,7 @@ def measure(name: str, fault: str, seed: int) -> Row:
     accuracy = accuracy_of(fit.adjusted, fit.observed)
     seconds = time.process_time() - start
     row: dict[str, Any] = {"scene": name, "fault": fault, "seed": seed, "gsd_m": scene.gsd_m, "cpu": seconds}
-    row |= {"found": compared(accuracy, scene), "settled": fit.adjusted.settled}
+    row |= {"found": compared(accuracy, scene), "settled": fit.adjusted.converged}
     row |= {"focal": [float(fit.adjusted.block.lenses[0].values[0]), float(scene.camera.params[0])]}
     row["focal"].append(float(accuracy.lens_sigmas()[0][0, 0] ** 0.5))
     noise = fit.noise

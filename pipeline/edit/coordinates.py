@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.splat.model.scene import NO_OFFSET, SceneFacts, turn_of
 from splatpipe.pipeline.survey.crs.world import World, open_world
 
-LARGEST = 1e9  # of a coordinate: no place on the earth has a larger one
+MAX_COORDINATE = 1e9  # largest magnitude of a coordinate, metres or degrees: no place on the earth has a larger one
 OWN, LOCAL = "own", "local"
 LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
 
@@ -76,9 +76,9 @@ class Coordinates:
         if self.world is None:
             return np.asarray((points - self.offset) @ self.frame_from_stated.T)
         found = self.world.local_from_crs(points)
-        if not (np.isfinite(found).all() and (np.abs(found) <= LARGEST).all()):
+        if not (np.isfinite(found).all() and (np.abs(found) <= MAX_COORDINATE).all()):
             raise UsageError(
-                f"{self.name} has no place for {_shown(points[~np.isfinite(found).all(axis=1)])}.",
+                f"{self.name} has no place for {_coordinates_text(points[~np.isfinite(found).all(axis=1)])}.",
                 hint="East (or longitude) comes first. With --local, numbers are metres from the splat's origin.",
             )
         return found
@@ -94,10 +94,10 @@ def parse_numbers(text: str, option: str, counts: Sequence[int], form: str) -> t
         form: The expected form, for the hint.
 
     Raises:
-        UsageError: if it is anything else, or a number is beyond ``LARGEST``.
+        UsageError: if it is anything else, or a number is beyond ``MAX_COORDINATE``.
     """
     numbers = [_number(part) for part in text.split(",")[: max(counts) + 1]]
-    if len(numbers) not in counts or not all(abs(number) <= LARGEST for number in numbers):
+    if len(numbers) not in counts or not all(abs(number) <= MAX_COORDINATE for number in numbers):
         raise UsageError(f'Cannot understand {option} "{text[:LONGEST_SHOWN]}".', hint=f"Write it as {option} {form}.")
     return tuple(numbers)
 
@@ -109,5 +109,5 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _shown(points: Float64[np.ndarray, "n 3"]) -> str:
+def _coordinates_text(points: Float64[np.ndarray, "n 3"]) -> str:
     return ",".join(f"{number:g}" for number in (points[0] if len(points) else np.zeros(0)))

@@ -19,8 +19,8 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.survey.boundary import WITHOUT, placed, placed_area
 from splatpipe.pipeline.survey.files.boundary_file import BoundaryFile, read_boundary
 
-DIGEST_CHARACTERS = 16  # of a polygon file's digest in a splat's record: enough to identify it
-SHOWN_DIGITS = 3  # of coordinates in messages
+DIGEST_CHARACTERS = 16  # hexadecimal digits of a polygon file's SHA-256 in a splat's record: enough to identify it
+MESSAGE_DECIMALS = 3  # decimals of coordinates in metres, in messages
 Inside = Callable[[Float64[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
 BOX_FORM = "X1,Y1,X2,Y2 or X1,Y1,Z1,X2,Y2,Z2"
 
@@ -212,4 +212,4 @@ def _nothing(what: str, piece: Workpiece, coordinates: Coordinates) -> Splatpipe
 
 def _digits(coordinates: Coordinates) -> int:
     degrees = coordinates.world is not None and coordinates.world.crs.is_geographic
-    return 7 if degrees else SHOWN_DIGITS
+    return 7 if degrees else MESSAGE_DECIMALS

@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 960, 720  # pixels of one image
 FIELD_DEG = 45.0  # vertical field of view of an oblique view
 ELEVATION_DEG, HEADING_DEG = 35.0, 30.0  # its angle below the horizon, and its heading clockwise from north
 SEEN = 0.3  # least share of a splat's centres within an image for it to count as shown
-AS_MANY = 0.95  # of the largest share: among such photos, the one that shows the splat largest is used
+NEARLY_MOST_SHARE = 0.95  # photos that show nearly the most centres; of these, the one with the largest splat is used
 LARGER = 3.0  # times a splat's own size: the most that an image may cover with the splat still recognisable
 NEAR = 0.005  # near plane as a share of the distance to the splat
 BACKGROUND = (0.82, 0.84, 0.86)  # contrasts with both white walls and dark roofs
@@ -66,7 +66,7 @@ def _best_photo(cameras: Sequence[Camera], points: Points) -> Camera | None:
     most = max(shares, default=0.0)
     if most < SEEN:
         return None
-    good = [camera for camera, share in zip(small, shares, strict=True) if share >= AS_MANY * most]
+    good = [camera for camera, share in zip(small, shares, strict=True) if share >= NEARLY_MOST_SHARE * most]
     return max(good, key=lambda camera: _spread(camera, points))  # the first one wins ties
 
 

@@ -22,9 +22,9 @@ from splatpipe.pipeline.splat.model.scene import Scene
 MAX_GAUSSIANS = 10**10  # Gaussians: more than any machine holds
 UNITS = {"KB": 10**3, "MB": 10**6, "GB": 10**9}
 SAMPLE = 50_000  # Gaussians written to estimate the bytes per Gaussian
-ROUNDS = 5  # of writing and measuring: the bytes per Gaussian depend on their number
-FULL = 0.93  # share of the allowed bytes that is close enough
-MARGIN = 0.985  # of the count that would just fit, for the next round
+MAX_ROUNDS = 5  # at most, of writing and measuring: the bytes per Gaussian depend on their number
+FULL_SHARE = 0.93  # share of the allowed bytes that is close enough
+NEXT_COUNT_SHARE = 0.985  # share of the Gaussians that would just fit which the next round writes
 FORM = "500000, 100MB or 1.5GB"
 
 _COUNT = re.compile(r"[0-9]{1,11}", re.ASCII)
@@ -97,17 +97,17 @@ class Reduce:
         each = self._bytes(replace(scene, gaussians=sample)) / max(1, len(sample))
         count, too_many = min(len(whole), max(1, int(self.size_bytes / each))), len(whole) + 1
         best = 0  # the largest count known to fit; it is merged again at the end rather than kept in memory
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ROUNDS):
             tried = reduce_to(whole, count)
             size = self._bytes(replace(scene, gaussians=tried))
             if size <= self.size_bytes:
                 best = count
-                if count >= len(whole) or size >= FULL * self.size_bytes:
+                if count >= len(whole) or size >= FULL_SHARE * self.size_bytes:
                     return tried
             else:
                 too_many = count
             del tried
-            wanted = math.floor(MARGIN * count * self.size_bytes / size)
+            wanted = math.floor(NEXT_COUNT_SHARE * count * self.size_bytes / size)
             wanted = max(1, min(wanted, too_many - 1, len(whole)))
             if best and wanted <= best:
                 break

@@ -23,14 +23,16 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
-STEEP = math.radians(-60.0)  # steeper than this, a camera has no heading of its own: the horizon is too far away
-TILTED = 0.1  # minimum horizontal part of the mean view of nadir cameras to define what is ahead
-FEW = 0.2  # of the cameras: if fewer are oblique, the others do not take their headings
+STEEP_PITCH_RAD = math.radians(
+    -60.0
+)  # steeper than this, a camera has no heading of its own: the horizon is too far away
+MIN_HORIZONTAL_PART = 0.1  # minimum horizontal part of the mean view of nadir cameras to define what is ahead
+MIN_OBLIQUE_SHARE = 0.2  # share of oblique cameras up to which the others do not take their headings
 FINE_STEPS, FINE_STEPS_A_PLACE = 4000, 10  # linear steps of a path, at least, and per position
-START_SHARE, START_S = 0.2, 1.0  # of a film's duration, and maximum seconds, to accelerate; the same to stop
-SLOW = 0.5  # of the median speed: below it the film slows down with the route
-REACH_SIGMAS = 4.0  # of the smoothing Gaussian
-MIN_LENGTH = 1e-6  # of a path: below it nothing moves
+ACCELERATION_SHARE, MAX_ACCELERATION_S = 0.2, 1.0  # to accelerate, and to brake: share of the film, and at most seconds
+SLOW_SPEED_RATIO = 0.5  # speed of the route over its median speed, below which the film slows down with the route
+KERNEL_SIGMAS = 4.0  # half width of the smoothing kernel, in its standard deviations
+MIN_PATH_LENGTH = 1e-6  # length of a path (as its ``distance`` measures it) below which nothing moves
 
 Doubles = Float64[np.ndarray, " n"]
 
@@ -128,8 +130,8 @@ def upright_route(cameras: Sequence[Camera], up: Float64[np.ndarray, " 3"]) -> R
     upright = rotation_to_up(up)
     places = np.array([camera.centre() for camera in cameras]) @ upright.T
     views = np.array([camera.cam_from_world[2, :3] for camera in cameras]) @ upright.T
-    own = np.flatnonzero(views[:, 2] > math.sin(STEEP))
-    if len(own) > FEW * len(cameras):
+    own = np.flatnonzero(views[:, 2] > math.sin(STEEP_PITCH_RAD))
+    if len(own) > MIN_OBLIQUE_SHARE * len(cameras):
         known = np.unwrap(np.arctan2(views[own, 1], views[own, 0]))
         headings = np.interp(np.arange(len(cameras)), own, known)
     else:
@@ -146,7 +148,7 @@ def _common_axis(axes: Float64[np.ndarray, "n 3"], ahead: Float64[np.ndarray, " 
     azimuth = 0.5 * math.atan2(float(np.sin(doubled).sum()), float(np.cos(doubled).sum()))
     mean = np.array([math.cos(azimuth), math.sin(azimuth)])
     sense = float(mean @ ahead[:2])
-    if abs(sense) < TILTED:
+    if abs(sense) < MIN_HORIZONTAL_PART:
         sense = float(mean @ axes[:, :2].mean(axis=0))
     return azimuth if sense >= 0.0 else azimuth + math.pi
 
@@ -193,15 +195,15 @@ def smoothed(route: Route, distance: float, width: float) -> tuple[Route, Double
         UsageError: if nothing moves.
     """
     along = np.append(0.0, np.cumsum(route.steps(distance)))
-    if not along[-1] > MIN_LENGTH:
+    if not along[-1] > MIN_PATH_LENGTH:
         raise UsageError("All photos were taken from one position, so there is no path between them.")
     count = max(FINE_STEPS, FINE_STEPS_A_PLACE * len(route))
     values = np.column_stack([np.interp(np.linspace(0.0, along[-1], count + 1), along, v) for v in route.values().T])
     own = along / along[-1] * count
-    half = min(count // 2, math.ceil(REACH_SIGMAS * width / along[-1] * count))
+    half = min(count // 2, math.ceil(KERNEL_SIGMAS * width / along[-1] * count))
     if half == 0:
         return route_of(values), own
-    once = np.exp(-0.5 * (np.arange(-half, half + 1) / (half / REACH_SIGMAS)) ** 2)
+    once = np.exp(-0.5 * (np.arange(-half, half + 1) / (half / KERNEL_SIGMAS)) ** 2)
     once /= once.sum()
     kernel = 2.0 * np.pad(once, half) - np.convolve(once, once)
     reach = 2 * half
@@ -225,8 +227,8 @@ def evenly_timed(route: Route, distance: float, frames: int, seconds: float) -> 
         Fractional indices into the route, for ``sampled``.
     """
     steps = route.steps(distance)
-    along = np.append(0.0, np.cumsum(np.hypot(steps, SLOW * np.median(steps))))
-    start = min(START_S, START_SHARE * seconds) / seconds
+    along = np.append(0.0, np.cumsum(np.hypot(steps, SLOW_SPEED_RATIO * np.median(steps))))
+    start = min(MAX_ACCELERATION_S, ACCELERATION_SHARE * seconds) / seconds
     at = along[-1] * soft_progress(np.linspace(0.0, 1.0, frames), start)
     return np.asarray(np.interp(at, along, np.arange(len(route))))
 
@@ -296,9 +298,9 @@ def centripetal_knots(route: Route, distance: float) -> Doubles:
         UsageError: if nothing moves.
     """
     gaps = route.steps(distance)
-    if not gaps.sum() > MIN_LENGTH:
+    if not gaps.sum() > MIN_PATH_LENGTH:
         raise UsageError("All keyframes are at one position, so there is no path between them.")
-    return np.append(0.0, np.cumsum(np.sqrt(np.maximum(gaps, MIN_LENGTH**2))))
+    return np.append(0.0, np.cumsum(np.sqrt(np.maximum(gaps, MIN_PATH_LENGTH**2))))
 
 
 def towards(places: Float64[np.ndarray, "n 3"], targets: Float64[np.ndarray, "n 3"]) -> Route:

@@ -31,7 +31,7 @@ from splatpipe.pipeline.film.camera_path import (
     towards,
 )
 from splatpipe.pipeline.survey.files.survey_text import (
-    LARGEST,
+    MAX_COORDINATE,
     UNKNOWN,
     LineError,
     TableKind,
@@ -166,7 +166,7 @@ def _of_item(number: int, item: Mapping[str, Any]) -> Numbers:
 
 
 def _finite(number: int, what: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_COORDINATE:
         raise LineError(0, f"{what} of keyframe {number} is {str(value)[:40]!r}, which is not a valid number")
     return float(value)
 

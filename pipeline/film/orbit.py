@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import UsageError
-from splatpipe.pipeline.film.camera_path import STEEP, Route, upright_route
+from splatpipe.pipeline.film.camera_path import STEEP_PITCH_RAD, Route, upright_route
 from splatpipe.pipeline.film.clearance import Clearance
 from splatpipe.pipeline.film.photo_route import PhotoTrack, followed_photos
 from splatpipe.pipeline.geometry.upright import rotation_to_up
@@ -43,7 +43,7 @@ def orbit(capture: PhotoTrack, frames: int) -> Route:
     targets = np.array([np.median(capture.points[capture.seen[index]], axis=0) for index in kept])
     middle = np.median(targets @ upright.T, axis=0)
     route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
-    oblique = route.pitches > STEEP
+    oblique = route.pitches > STEEP_PITCH_RAD
     places = (route.places[oblique] if oblique.any() else route.places) - middle
     distance = float(np.median(np.linalg.norm(places, axis=1)))
     elevation = float(np.median(np.arctan2(places[:, 2], np.hypot(places[:, 0], places[:, 1]))))

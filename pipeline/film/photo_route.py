@@ -21,7 +21,7 @@ from splatpipe.pipeline.geometry.upright import rotation_to_up
 
 SPEED = 0.7  # comfortable speed, path lengths (see ``camera_path``) per second: around a building, 28° per second
 CORNER_S = 1.0  # standard deviation of the Gaussian that rounds corners, seconds at that speed
-CORNER_LEGS = 0.6  # the same in legs between photos, if these are longer
+CORNER_LEGS = 0.6  # standard deviation of that Gaussian in median distances between photos, if this is longer
 ALONE_LEGS, ALONE_LENGTH = 4.0, 0.5  # a stray's distance to the nearest photo: in median distances, and in lengths
 FEWEST_SEEN = 10  # sparse points; a photo that sees fewer is unreliable
 ODD_DEPTH = 5.0  # times nearer or farther than the others: the ground at take-off, a test shot of the sky

@@ -50,7 +50,7 @@ class VideoWriter:
             raise ValueError(f"{path.name} is not a film file")
         self._path, self._size, self._fps = path.absolute(), size, fps
         for left in self._path.parent.glob(f".{glob.escape(self._path.stem)}.{'?' * 16}.part{path.suffix}"):
-            left.unlink()  # of a killed process
+            left.unlink()  # left by a killed process
         self._partial = self._path.with_name(f".{self._path.stem}.{token()}.part{path.suffix}")
         self._frames = 0
         try:

@@ -45,14 +45,14 @@ REFINED_HYPOTHESES = 5
 LOCAL_ROUNDS = 5
 WEAK_ROTATION_RAD = math.radians(5.0)  # a rotation known less well than this uses the prior, if there is one
 IRLS_ROUNDS = 50
-IRLS_TOLERANCE = 1e-13  # of a step, in radians and relative to the extent
+IRLS_TOLERANCE = 1e-13  # size of a step at which iterations end: radians, and relative to the extent
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
 OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors are never this large
 LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be estimated
 CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at about 1 in 10,000
 OUTLIER_SIGMAS = 3.0  # an error within the position's stated accuracy is not an outlier
-MIN_NOISE = 1e-9  # of the stated sigmas: exact data have no spread to measure
+MIN_NOISE_RATIO = 1e-9  # least noise as a multiple of the stated sigmas: exact data have no spread to measure
 MAX_GROUPS = 20  # groups whose own triples are tried: one good group is enough
 
 
@@ -196,8 +196,8 @@ def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tupl
         used = int(fit.inliers.sum())
         degrees = max(1, 3 * used - SIMILARITY)
         spread = math.sqrt(3.0 * float((normed(fit.residuals, points)[fit.inliers] ** 2).sum()) / degrees)
-        settled = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
-        if settled or used == len(points) or limit.most > widest:
+        is_consistent = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
+        if is_consistent or used == len(points) or limit.most > widest:
             return fit, limit
         limit = InlierLimit(LIMIT_STEP * limit.most, of_sigmas=True)
 
@@ -221,11 +221,11 @@ def _consensus(points: Correspondences, limit: InlierLimit, hypotheses: list[Sim
         for _ in range(LOCAL_ROUNDS):
             if cost < best_cost:
                 best_cost, best = cost, candidate
-            settled = points.without(_median_offsets(candidate, points))
-            near = limit.near(_residuals(candidate, settled), points)
+            without_offsets = points.without(_median_offsets(candidate, points))
+            near = limit.near(_residuals(candidate, without_offsets), points)
             if near.sum() < 3:
                 break
-            candidate = _closed_form(settled.only(near), weights[near])
+            candidate = _closed_form(without_offsets.only(near), weights[near])
             cost = float(_costs(points, limit, [candidate])[0])
     return best
 
@@ -248,8 +248,8 @@ def _refine(
 ) -> SimilarityFit:
     """Reweighted least squares on the points near the fit, until the inliers no longer change."""
     similarity = start
-    settled = points.without(_median_offsets(start, points))
-    inliers = limit.near(_residuals(start, settled), points)
+    without_offsets = points.without(_median_offsets(start, points))
+    inliers = limit.near(_residuals(start, without_offsets), points)
     if inliers.sum() < 3:
         inliers = np.ones(len(points), dtype=bool)
     near, noise, offsets = inliers, 1.0, np.zeros((0, 3))
@@ -287,7 +287,7 @@ def _reweighted(
     stated = points
     for _ in range(IRLS_ROUNDS):
         off = normed(_residuals(similarity, points.without(offsets)), points)
-        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, MIN_NOISE)
+        noise = max(float(np.median(off)) / MEDIAN_OF_CHI3, MIN_NOISE_RATIO)
         weights = _sigma_weights(points) / (1.0 + (off / (CAUCHY * noise)) ** 2)[:, None]
         points = stated.at_noise(noise)
         problem = _Problem(points, similarity)

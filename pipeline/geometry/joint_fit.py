@@ -16,12 +16,12 @@ from jaxtyping import Bool, Float64, Int64
 from splatpipe.pipeline.geometry.alignment import DirectionPrior
 from splatpipe.pipeline.geometry.similarity import Similarity, cross_matrix, rotation_from_vector
 
-ROUNDS = 50
-TOLERANCE = 1e-12  # of a step, in radians and relative to the extent
+MAX_ROUNDS = 50
+STEP_TOLERANCE = 1e-12  # size of a step at which iterations end: radians, and relative to the extent
 FREE = 1e-13  # an eigenvalue below this, relative to the largest, is rounding
 SIMILARITY = 7
 QUIET = 2.5  # times the stated sigmas: control that agrees this well is not searched for blunders
-CRITICAL, CRITICAL_FEW = 4.0, 24.0  # of a studentised residual; a little over Student's t at 1 in 1000, by its degrees
+CRITICAL, CRITICAL_FEW = 4.0, 24.0  # studentised residual of a blunder: a little over Student's t at 1 in 1000
 MAX_PAIRED = 40  # points up to which pairs are tried, too
 MIN_LEFT = 3
 MAX_SUSPECTS = 100  # points tried, those with the largest residuals; a blunder is among them
@@ -117,7 +117,7 @@ def fit_jointly(start: Similarity, observed: JointObservations, priors: Priors) 
     similarity, offsets = start, np.zeros_like(priors.offset_sigmas)
     groups = len(offsets)
     member = (observed.group[:, None] == np.arange(groups)).astype(np.float64)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         residuals = similarity.apply(observed.source) + member @ offsets - observed.target
         jacobian = _full_jacobian(similarity, observed, mean, member)
         information = np.einsum("nkp,nk,nkq->pq", jacobian, weights, jacobian)
@@ -132,7 +132,7 @@ def fit_jointly(start: Similarity, observed: JointObservations, priors: Priors) 
         similarity = _moved(similarity, mean, step)
         offsets = offsets + step[SIMILARITY:].reshape(-1, 3)
         extent = max(float(np.ptp(observed.target, axis=0).max()), 1e-9)
-        if np.abs(step[:4]).max() < TOLERANCE and np.abs(step[4:]).max() < TOLERANCE * extent:
+        if np.abs(step[:4]).max() < STEP_TOLERANCE and np.abs(step[4:]).max() < STEP_TOLERANCE * extent:
             break
     residuals = np.asarray(similarity.apply(observed.source) + member @ offsets - observed.target)
     noise, degrees = _noise(residuals, observed)

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 MAX_PAIRS = 400  # hypotheses per point; with a third of its marks right, one pair in nine is right
-ROUNDS = 20
-TOLERANCE = 1e-12  # of a step, relative to the point's depth
+MAX_ROUNDS = 20
+STEP_TOLERANCE = 1e-12  # length of a step over the point's depth at which iterations end
 MIN_PARALLAX_RAD = np.radians(1.0)  # below it the depth is a guess
 
 
@@ -139,7 +139,7 @@ def _meeting(rays: Rays) -> Float64[np.ndarray, " 3"] | None:
 def _refined(rays: Rays, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
     """The point that minimizes the squared reprojection errors (Gauss-Newton)."""
     depth = float(np.linalg.norm(rays.centres() - point, axis=1).min())
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         residuals = rays.residuals_px(point)
         if not np.isfinite(residuals).all():
             break
@@ -148,6 +148,6 @@ def _refined(rays: Rays, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray
         length = float(np.linalg.norm(step))
         step *= min(1.0, 0.5 * depth / max(length, 1e-300))
         point = point + step
-        if length < TOLERANCE * depth:
+        if length < STEP_TOLERANCE * depth:
             break
     return point

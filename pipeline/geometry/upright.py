@@ -26,14 +26,14 @@ STEADY = 0.997  # within about 4°: a gimbal, which points down better than the 
 PARALLEL = 0.9995  # within about 2°: nobody holds a camera this steady while walking
 SCATTERED = 0.5  # below this, the vectors mostly cancel
 GRID = 0.3  # least spread of the cameras along the image's height, over that along its width, of a survey
-MIN_WIDTH = 0.2  # of the fan of the cameras' horizontal axes: a narrower one does not determine its plane
-MAX_THICKNESS = 0.35  # of that fan, over its width
+MIN_FAN_WIDTH = 0.2  # width of the fan of the cameras' horizontal axes (a sine) that determines their plane
+MAX_FAN_THICKNESS_RATIO = 0.35  # thickness of that fan over its width, below which the axes lie in a plane
 GROUND_POINTS = 5000
 MIN_GROUND_POINTS = 50
 GROUND_SAMPLES = 500
 GROUND_COSINE = math.cos(math.radians(40.0))  # between the ground's normal and the cameras' mean view
 GROUND_THICKNESS = 0.015  # over the cameras' height above it
-GROUND_SHARE = 0.2  # of the points
+MIN_GROUND_SHARE = 0.2  # least share of the points that lie on the ground plane
 ROBUST_ROUNDS = 20
 MIN_WEIGHT_RAD = 0.01
 
@@ -96,7 +96,7 @@ def up_from_cameras(
     """
     mean_up, mean_forward = axes.up.mean(axis=0), axes.forward.mean(axis=0)
     normal, thickness, width = _plane_normal(axes.right)
-    if width > MIN_WIDTH and thickness < MAX_THICKNESS * width:
+    if width > MIN_FAN_WIDTH and thickness < MAX_FAN_THICKNESS_RATIO * width:
         sign = float(np.sign(((axes.up - axes.forward) @ normal).sum())) or 1.0
         return UpEstimate(sign * normal, "the horizontal edges of the pictures")
     alike_up, alike_forward = float(np.linalg.norm(mean_up)), float(np.linalg.norm(mean_forward))
@@ -134,8 +134,8 @@ def up_without_orientation(
     (_, thickness, width), (normal, other_thickness, other_width) = (
         _plane_normal(axes.right) for axes in (upright, turned)
     )
-    is_plane = other_width > MIN_WIDTH and other_thickness < MAX_THICKNESS * other_width
-    if not is_plane or (width > MIN_WIDTH and thickness * other_width <= other_thickness * width):
+    is_plane = other_width > MIN_FAN_WIDTH and other_thickness < MAX_FAN_THICKNESS_RATIO * other_width
+    if not is_plane or (width > MIN_FAN_WIDTH and thickness * other_width <= other_thickness * width):
         return up_from_cameras(upright, centres, points)
     light = np.einsum("nij,ni->nj", cam_from_world[:, :2], brighter()).sum(axis=0)
     return UpEstimate(
@@ -231,7 +231,7 @@ def _ground_normal(
             on_plane = np.abs((chosen - corner) @ normal) < GROUND_THICKNESS * abs(height)
             if int(on_plane.sum()) > best:
                 best, near = int(on_plane.sum()), on_plane
-    if best < GROUND_SHARE * len(chosen):
+    if best < MIN_GROUND_SHARE * len(chosen):
         return None
     ground = chosen[near]
     normal = np.linalg.eigh(np.cov(ground.T))[1][:, 0]

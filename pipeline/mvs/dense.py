@@ -158,11 +158,11 @@ def thin_out(points: DensePoints, sparse: Float64[np.ndarray, "m 3"], most: int)
         return points
     middle = float(np.median(points.spacing))
     sizes = middle * 2.0 ** np.round(np.log2(points.spacing / middle))
-    ranked = np.argsort(-points.scores, kind="stable")
+    by_score = np.argsort(-points.scores, kind="stable")
     while True:
-        rows = _first_per_voxel(points.xyz[ranked], sizes[ranked], sparse)
+        rows = _first_per_voxel(points.xyz[by_score], sizes[by_score], sparse)
         if rows.size <= most:
-            return points.select(np.sort(ranked[rows]))
+            return points.select(np.sort(by_score[rows]))
         sizes = sizes * GROWTH
 
 

@@ -16,10 +16,10 @@ from jaxtyping import Float32, Int64, UInt8
 REACH_PX = 3  # the most by which an object's depth extends beyond its edge
 AROUND_PX = 2 * REACH_PX + 1  # radius in which both sides of an edge are sampled,
 SIGMA_PX = REACH_PX + 1.0  # with this Gaussian weight
-BEHIND = 0.02  # of the depth: farther by more than this is another object,
-SAME = 0.01  # and within this much is the same object
-MIN_CONTRAST = 30.0  # of 441, between the colours of both sides: below it, a pixel cannot be assigned to a side
-MAX_RATIO = 0.7  # of a background pixel's colour difference from the background, to that from the foreground
+MIN_DEPTH_STEP = 0.02  # difference in depth, relative, above which a farther pixel is another object,
+MAX_DEPTH_STEP = 0.01  # and within this much is the same object
+MIN_CONTRAST = 30.0  # RGB distance (0 to 441) between both sides, below which a pixel cannot be assigned to a side
+MAX_COLOUR_RATIO = 0.7  # colour distance of a background pixel to the background over that to the foreground
 
 Pixels = tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]
 Values = Float32[np.ndarray, " n"]
@@ -54,12 +54,12 @@ def pixels_behind(
         Rows and columns of the pixels, and the background's depth there.
     """
     reach = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
-    at_edge = (depth > 0.0) & (cv2.dilate(depth, reach) > depth * (1.0 + BEHIND))
+    at_edge = (depth > 0.0) & (cv2.dilate(depth, reach) > depth * (1.0 + MIN_DEPTH_STEP))
     rows, columns = np.nonzero(at_edge)
     front, back = _sides(np.where(at_edge, np.float32(0.0), depth), depth, colour, (rows, columns))
     seen = colour[rows, columns].astype(np.float32)
     decidable = (front.weight > 0.0) & (back.weight > 0.0) & (_difference(front.colour, back.colour) > MIN_CONTRAST)
-    wrong = decidable & (_difference(seen, back.colour) < MAX_RATIO * _difference(seen, front.colour))
+    wrong = decidable & (_difference(seen, back.colour) < MAX_COLOUR_RATIO * _difference(seen, front.colour))
     return rows[wrong], columns[wrong], back.depth[wrong]
 
 
@@ -87,7 +87,7 @@ def _sides(
         there = rows + down, columns + right
         seen = colour[there].astype(np.float32)
         before, found = inner[there], depth[there]
-        belongs = np.abs(before - own) < SAME * own, found > own * (1.0 + BEHIND)
+        belongs = np.abs(before - own) < MAX_DEPTH_STEP * own, found > own * (1.0 + MIN_DEPTH_STEP)
         for side, (here, deep) in enumerate(zip(belongs, (before, found), strict=True)):
             weight = np.where(here, nearness, np.float32(0.0))
             weights[side] += weight

@@ -11,8 +11,8 @@ import numpy as np
 
 from splatpipe.pipeline.mvs.depth_maps import DepthMap
 
-MIN_CONFIDENCE = 5  # of a rendered depth: on plain walls, 3 in 4 below it were more than 2 GSD off, and 1 in 8 above it
-SAME = 0.02  # of the depth: a smaller difference means the same surface
+MIN_CONFIDENCE = 5  # rendered depths below it are not used: on plain walls, 3 in 4 were over 2 GSD off, 1 in 8 above it
+MAX_DEPTH_DIFFERENCE = 0.02  # difference of two depths, relative, up to which they are one surface's
 MIN_PIXELS = 1000  # pixels with both depths needed to estimate the offset
 
 
@@ -42,5 +42,5 @@ def median_offset(found: DepthMap, rendered: DepthMap) -> float:
     """Median offset of rendered behind photo depths, as a share of the depth; 0 if few pixels have both."""
     both = (found.confidence > 0) & (rendered.confidence >= MIN_CONFIDENCE)
     share = rendered.depth[both].astype(np.float64) / found.depth[both] - 1.0
-    share = share[np.abs(share) < SAME]
+    share = share[np.abs(share) < MAX_DEPTH_DIFFERENCE]
     return float(np.median(share)) if share.size >= MIN_PIXELS else 0.0

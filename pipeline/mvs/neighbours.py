@@ -17,8 +17,8 @@ NARROW_DEG = 4.0  # spread of the weight below the best angle
 WIDE_DEG = 10.0  # and above
 MIN_SHARED = 8  # points; two photos with fewer overlap by chance or only at an edge
 MIN_POINTS = 20  # a photo with fewer has no reliable depth range
-PERCENTILES = (1.0, 99.0)  # of the depths: excludes the few wrong points
-MAX_DEPTH_RATIO = 1000.0  # of the far to the near end of the range
+DEPTH_PERCENTILES = (1.0, 99.0)  # percentiles that bound a photo's depths: without the few wrong points
+MAX_DEPTH_RATIO = 1000.0  # far over near end of a photo's depth range, at most
 BEYOND = 10.0  # times the depth of the farthest points: hills and trees behind have few; costs only a few more planes
 
 
@@ -76,8 +76,8 @@ def neighbours(tracks: SparseVisibility, cameras: Sequence[Camera], most: int) -
         shared = np.bincount(others, minlength=len(cameras))
         score = np.where(shared >= MIN_SHARED, np.bincount(others, weights, minlength=len(cameras)), 0.0)
         score[view] = 0.0
-        ranked = np.argsort(-score, kind="stable")[:most]
-        found.append([int(other) for other in ranked if score[other] > 0.0])
+        by_score = np.argsort(-score, kind="stable")[:most]
+        found.append([int(other) for other in by_score if score[other] > 0.0])
     return found
 
 
@@ -109,5 +109,5 @@ def inverse_depths(tracks: SparseVisibility, view: int, camera: Camera, wider: f
     depths = depths[depths > 0.0]
     if depths.size < MIN_POINTS:
         return None
-    near, far = (float(depth) for depth in np.percentile(depths, PERCENTILES))
+    near, far = (float(depth) for depth in np.percentile(depths, DEPTH_PERCENTILES))
     return 1.0 / (far * BEYOND), wider / max(near, far / MAX_DEPTH_RATIO)

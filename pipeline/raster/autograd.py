@@ -75,8 +75,12 @@ class UnfinishedRender:
         Returns:
             Number of rows skipped because their gradients were not finite.
         """
-        shown = self.frame.visible
-        seen = None if self.probe is None else (torch.empty(shown, dtype=torch.int64), torch.empty(shown, 2))
+        visible_count = self.frame.visible
+        seen = (
+            None
+            if self.probe is None
+            else (torch.empty(visible_count, dtype=torch.int64), torch.empty(visible_count, 2))
+        )
         skipped = self.frame.step(
             self.parameters,
             [values[name].detach() for name in PARAMETERS],

@@ -37,7 +37,7 @@ class CudaFrame:
 
     Attributes:
         kernels: The kernels that rendered it.
-        shot: The camera and render settings.
+        view: The camera and render settings.
         parameters: The rendered parameters, in the order of ``PARAMETERS``.
         memory: The frame's memory.
         capacity: Number of pairs that it holds at a time.
@@ -45,7 +45,7 @@ class CudaFrame:
     """
 
     kernels: CudaKernels
-    shot: SplatShot
+    view: SplatShot
     parameters: tuple[Tensor, ...]
     memory: Tensor
     capacity: int
@@ -54,7 +54,7 @@ class CudaFrame:
     @staticmethod
     def render(
         kernels: CudaKernels,
-        shot: SplatShot,
+        view: SplatShot,
         parameters: tuple[Tensor, ...],
         outputs: Sequence[Tensor | None],
         may_shrink: bool = True,
@@ -63,7 +63,7 @@ class CudaFrame:
 
         Args:
             kernels: The kernels to use.
-            shot: The camera and render settings.
+            view: The camera and render settings.
             parameters: The model's parameters, in the order of ``PARAMETERS``.
             outputs: As above.
             may_shrink: Whether to make chunks smaller if memory is short; a training does that itself, with a warning.
@@ -71,17 +71,17 @@ class CudaFrame:
             Raises:
                 torch.OutOfMemoryError: if memory is short and smaller chunks did not help or are not allowed.
         """
-        tiles = -(-shot.width // TILE_PX) * -(-shot.height // TILE_PX)
+        tiles = -(-view.width // TILE_PX) * -(-view.height // TILE_PX)
         size = FrameSize(len(parameters[0]), tiles)
         while True:
             room = kernels.forecast.room(size)
             try:
-                memory = kernels.empty(kernels.frame_bytes(shot, size.count, room.capacity))
+                memory = kernels.empty(kernels.frame_bytes(view, size.count, room.capacity))
                 break
             except torch.OutOfMemoryError:
                 if not may_shrink or not kernels.forecast.shrink():
                     raise
-        frame = CudaFrame(kernels, shot, parameters, memory, room.capacity, room.passes)
+        frame = CudaFrame(kernels, view, parameters, memory, room.capacity, room.passes)
         *pictures, radii, visible = outputs
         kernels.call(
             "splat_forward",
@@ -102,7 +102,7 @@ class CudaFrame:
         Raises:
             torch.OutOfMemoryError: if there is too little.
         """
-        back = self.kernels.empty(self.kernels.back_bytes(self.shot, len(self.parameters[0]), self.capacity))
+        back = self.kernels.empty(self.kernels.back_bytes(self.view, len(self.parameters[0]), self.capacity))
         gradients = SplatPictureGradients(*map(self.kernels.at, pictures))
         self.kernels.call("splat_blend_backward", *self._said(back), ctypes.byref(gradients))
         return back
@@ -117,8 +117,8 @@ class CudaFrame:
 
     def step(self, back: Tensor, step: SplatStep, means2d: Float[Tensor, "n 2"] | None) -> None:
         """The same, fused with a step of Adam."""
-        shot, _, frame = self._said(back)
-        self.kernels.call("splat_step", shot, frame, ctypes.byref(step), self.kernels.at(means2d))
+        view, _, frame = self._said(back)
+        self.kernels.call("splat_step", view, frame, ctypes.byref(step), self.kernels.at(means2d))
 
     def _said(self, back: Tensor | None) -> tuple[object, object, object]:
         """The shot, the parameters and the frame in the form that the library takes."""
@@ -131,7 +131,7 @@ class CudaFrame:
             capacity=self.capacity,
             passes=self.passes,
         )
-        return ctypes.byref(self.shot), ctypes.byref(self.kernels.rows(self.parameters)), ctypes.byref(frame)
+        return ctypes.byref(self.view), ctypes.byref(self.kernels.rows(self.parameters)), ctypes.byref(frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,18 +242,18 @@ class _Rasterize(torch.autograd.Function):
         colour, alpha, radii = (parameters[0].new_empty(shape) for shape in ((*size, 3), size, (n,)))
         depths = tuple(alpha.new_empty(size) if options.depth else None for _ in range(3))
         visible = torch.empty(n, dtype=torch.uint8, device=colour.device)
-        shot = shot_of(camera, options, parameters[-1].shape[1])
+        view = shot_of(camera, options, parameters[-1].shape[1])
         outputs = (colour, alpha, *depths, radii, visible)
-        frame = CudaFrame.render(kernels, shot, parameters, outputs, may_shrink=buffers is None)
+        frame = CudaFrame.render(kernels, view, parameters, outputs, may_shrink=buffers is None)
         seen = visible.view(torch.bool)
-        shown = tuple(alpha.new_zeros(()).expand(size) if depth is None else depth for depth in depths)
+        depth_outputs = tuple(alpha.new_zeros(()).expand(size) if depth is None else depth for depth in depths)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(shown[2], seen, radii, *(() if options.depth else shown[:2]))
+        ctx.mark_non_differentiable(depth_outputs[2], seen, radii, *(() if options.depth else depth_outputs[:2]))
         if any(ctx.needs_input_grad):
             ctx.frame, ctx.visible, ctx.buffers, ctx.probe = frame, seen, buffers, probe
             ctx.leaves = [tensor.is_leaf for tensor in leaves]
             ctx.save_for_backward(*parameters)
-        return colour, alpha, *shown, seen, radii
+        return colour, alpha, *depth_outputs, seen, radii
 
     @staticmethod
     @once_differentiable

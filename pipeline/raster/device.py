@@ -121,7 +121,7 @@ def choose_device(wanted: str, unfit: str = "", note: Note | None = None) -> Dev
     if wanted == "cpu":
         return cpu()
     os.environ.setdefault(*CUBLAS_WORKSPACE)  # read when its first product is computed
-    missing = _why_not(unfit)
+    missing = _unavailable(unfit)
     if wanted == "cuda" and missing is not None:
         raise missing.error()
     if missing is not None:
@@ -133,7 +133,7 @@ def choose_device(wanted: str, unfit: str = "", note: Note | None = None) -> Dev
     return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
 
 
-def _why_not(unfit: str) -> cuda_library.NoCuda | None:
+def _unavailable(unfit: str) -> cuda_library.NoCuda | None:
     if unfit:
         return cuda_library.NoCuda(unfit, "")
     return cuda_library.unavailable_reason() or cuda_library.cannot_compute()

@@ -80,9 +80,9 @@ def photo_loss_reference(
     seen = torch.where(counts[..., None], render, photo)
     if inner is not None:
         left, top, right, bottom = inner
-        counted = torch.zeros_like(counts)
-        counted[top:bottom, left:right] = counts[top:bottom, left:right]
-        counts = counted
+        inner_counts = torch.zeros_like(counts)
+        inner_counts[top:bottom, left:right] = counts[top:bottom, left:right]
+        counts = inner_counts
     similarity = ssim(seen.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None], SSIM_WINDOW)[0]  # (3, h, w)
     number = 3 * max(1, int(counts.sum()))
     l1 = torch.where(counts[..., None], (seen - photo).abs(), 0.0).sum() / number

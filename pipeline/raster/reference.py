@@ -134,13 +134,13 @@ def project(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> Spl
 
     axes = rotation_from_quats(gaussians.quats) * torch.exp(gaussians.log_scales)[:, None, :]  # (n, 3, 3)
     jacobian = projection_jacobian(points, camera) @ pose[:3, :3]  # (n, 2, 3) J W
-    row_x, row_y = (jacobian @ axes).unbind(-2)  # of B (n, 2, 3) with Σ' = B Bᵀ
+    row_x, row_y = (jacobian @ axes).unbind(-2)  # rows of the Jacobian B (n, 2, 3), with Σ' = B Bᵀ
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     sharp = (torch.linalg.cross(row_x, row_y) ** 2).sum(-1)  # det Σ' without cancellation (Cauchy-Binet)
     determinants = sharp + BLUR_PX2 * (xx + yy) + BLUR_PX2**2
     covariances = torch.stack([xx + BLUR_PX2, xy, yy + BLUR_PX2], -1)
 
-    row_z = torch.einsum("j,njk->nk", pose[2, :3], axes)  # of the depth, as row_x and row_y of x and y on the screen
+    row_z = torch.einsum("j,njk->nk", pose[2, :3], axes)  # gradient of the depth; row_x, row_y are those of x, y
     zx, zy = (row_z * row_x).sum(-1), (row_z * row_y).sum(-1)
     slopes_x, slopes_y = (yy + BLUR_PX2) * zx - xy * zy, (xx + BLUR_PX2) * zy - xy * zx
     depth_slopes = torch.stack([slopes_x, slopes_y], -1) / determinants[:, None]  # Σ'⁻¹ (zx, zy)

@@ -69,13 +69,13 @@ def laid_over_nodes_reference(
     """The same by its definition, in any dtype and on any device."""
     height, width = alpha.shape
     moving = between_nodes(nodes, height, width, behind.step)
-    shown = moving.detach()
+    sky = moving.detach()
     if behind.mask is not None:
-        shown = torch.where(behind.mask[:, :, None], moving, shown)
+        sky = torch.where(behind.mask[:, :, None], moving, sky)
     if behind.elsewhere is not None and behind.around is not None:
         other = between_nodes(behind.elsewhere, height, width, behind.step)
-        shown = torch.where(behind.around[:, :, None], shown, other)
-    return composite_over(colour, alpha, behind.background, shown)
+        sky = torch.where(behind.around[:, :, None], sky, other)
+    return composite_over(colour, alpha, behind.background, sky)
 
 
 class _SkyComposite(torch.autograd.Function):

@@ -24,9 +24,9 @@ from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.quality.free_space import MARGIN, SUPPORT_TRACK, spread_along
 
-LARGEST_MEGAPIXELS = 0.5  # of the renders: floaters are larger than their pixels
-SLICES = 8  # of a photo's points by depth, each with a render of everything nearer than its first: 8 renders a photo
-MIN_POINTS = 20  # of a photo that counts: fewer lie in one corner of it
+MAX_MEGAPIXELS = 0.5  # size of the renders: floaters are larger than their pixels
+SLICES = 8  # parts of a photo's points by depth; each is judged by a render of everything nearer than its first point
+MIN_POINTS = 20  # points a photo needs to be measured: fewer lie in one corner of it
 MAX_TRAINED = (
     64  # training photos, evenly over the capture, where none is held out: as many as a large capture holds out
 )
@@ -58,7 +58,7 @@ def measure_blocked_light(
     shares: dict[str, float] = {}
     points = 0
     for place in asked:
-        small, rows = reduced_camera(cameras[place], LARGEST_MEGAPIXELS), seen[place]
+        small, rows = reduced_camera(cameras[place], MAX_MEGAPIXELS), seen[place]
         stopped = blocked_shares(gaussians, small, xyz[rows[sure[rows]]], options)
         if len(stopped) >= MIN_POINTS:
             shares[small.name] = float(stopped.mean())

@@ -22,10 +22,10 @@ from jaxtyping import Float, Float64, Int64
 
 from splatpipe.pipeline.geometry.camera import Camera
 
-AGREEMENT = 0.05  # of the depth: far more than a pixel's step on slanted ground, far less than a floater's distance
+DEPTH_TOLERANCE = 0.05  # relative; far more than a pixel's step on slanted ground, far less than a floater's distance
 SAMPLE_EVERY = 4  # pixels, both ways: thousands remain of the smallest image
 NO_SURFACE = 1.0  # stands for the infinite difference where the neighbour sees no surface, and caps the others
-PAIRS = 12  # of neighbours: enough for the median, in a few seconds of rendering
+MAX_PAIRS = 12  # pairs of neighbouring photos: enough for the median, in a few seconds of rendering
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class DepthDisagreement:
 
     Attributes:
         median: Median magnitude of the differences, as a share of the depth; None without pixels.
-        share: Share of the pixels where the neighbour sees more than `AGREEMENT` farther; None without pixels.
+        share: Share of the pixels where the neighbour sees more than ``DEPTH_TOLERANCE`` farther; None without pixels.
         pixels: Number of pixels compared.
     """
 
@@ -43,7 +43,7 @@ class DepthDisagreement:
     pixels: int
 
 
-def neighbouring_pairs(seen: Sequence[Int64[np.ndarray, " _"]], most: int = PAIRS) -> list[tuple[int, int]]:
+def neighbouring_pairs(seen: Sequence[Int64[np.ndarray, " _"]], most: int = MAX_PAIRS) -> list[tuple[int, int]]:
     """Pairs of views that share sparse points: evenly chosen views, each with the view that shares most.
 
     Args:
@@ -94,7 +94,7 @@ def depth_differences(
     world = camera.unproject(np.stack((columns + 0.5, rows + 0.5), axis=1), z)
     _, pixels, there = neighbour.in_view(world)
     best = _best_around(pixels.astype(np.int64), there, neighbour_depth)
-    return best[best >= -AGREEMENT]
+    return best[best >= -DEPTH_TOLERANCE]
 
 
 def _best_around(
@@ -122,4 +122,4 @@ def depth_disagreement(differences: Sequence[Float64[np.ndarray, " _"]]) -> Dept
     every = np.concatenate([np.empty(0), *differences])
     if every.size == 0:
         return DepthDisagreement(None, None, 0)
-    return DepthDisagreement(float(np.median(np.abs(every))), float(np.mean(every > AGREEMENT)), int(every.size))
+    return DepthDisagreement(float(np.median(np.abs(every))), float(np.mean(every > DEPTH_TOLERANCE)), int(every.size))

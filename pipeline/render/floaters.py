@@ -23,7 +23,7 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 from splatpipe.pipeline.splat.quality.free_space import free_space, near_or_free, share_of_opacity
 
-LARGEST_MEGAPIXELS = 0.5  # of a depth map: floaters are larger than its pixels, and results of all sizes compare
+MAX_MEGAPIXELS = 0.5  # size of the depth maps: floaters are larger than their pixels, and results of all sizes compare
 
 
 def measure_floaters(
@@ -51,14 +51,14 @@ def measure_floaters(
     seen = [tracks[camera.name] for camera in cameras]
     space = free_space(cameras, points.xyz, seen)
     chosen = near_or_free(gaussians, space)
-    floating, counted = share_of_opacity(gaussians, chosen), seen
+    floating, inside_seen = share_of_opacity(gaussians, chosen), seen
     if area is not None:
         inside, counts = _inside(area, gaussians), area.contains(points.xyz)
         floating, chosen = share_of_opacity(gaussians.select(inside), chosen[inside]), chosen & inside
-        counted = [rows[counts[rows]] for rows in seen]
+        inside_seen = [rows[counts[rows]] for rows in seen]
     pairs = neighbouring_pairs(seen)
     places = sorted({place for pair in pairs for place in pair})
-    small = {place: reduced_camera(cameras[place], LARGEST_MEGAPIXELS) for place in places}
+    small = {place: reduced_camera(cameras[place], MAX_MEGAPIXELS) for place in places}
     flagged, depths, light = _flagged(gaussians, chosen), {}, np.zeros(2)
     for place in places:
         depths[place], of_view = _depth_and_light(flagged, small[place], options)
@@ -66,7 +66,7 @@ def measure_floaters(
     both = [direction for a, b in pairs for direction in ((a, b), (b, a))]
     apart = depth_disagreement([depth_differences(small[a], depths[a], small[b], depths[b]) for a, b in both])
     return {
-        "veil": measure_blocked_light(gaussians, cameras, (points.xyz, counted), held_out, options),
+        "veil": measure_blocked_light(gaussians, cameras, (points.xyz, inside_seen), held_out, options),
         "free_space_opacity": _rounded(floating) if space.known else None,
         "free_space_gaussians": int(chosen.sum()) if space.known else None,
         "free_space_rendered": _rounded(light[0] / light[1]) if space.known and light[1] > 0.0 else None,

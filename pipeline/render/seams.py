@@ -40,9 +40,9 @@ ROW_CAPS = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05,
 # edge of a house must not outweigh all others
 STATION = 0.7  # spacing of cameras along the border, as a share of the height above the surface
 FARTHEST = 2.5  # times that height: farther rows are seen at too small an angle
-PIECE = 0.35  # of that height: minimum length of a piece of border that is judged by itself
+PIECE_LENGTH = 0.35  # least length of a piece of border that is judged by itself, over the height above the surface
 MIN_ROWS = 24  # per piece, over all images
-TILT = math.radians(45.0)  # of the oblique cameras, below the horizon
+TILT_RAD = math.radians(45.0)  # angle of the oblique cameras below the horizon
 LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks/seams.py` prints what they detect
     "alpha": (5.0, 0.002),
     "hole": (4.2, 0.15),
@@ -52,7 +52,7 @@ LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks
     "step": (5.5, 0.012),
 }
 PIECE_FACTORS = (2.2, 2.5)  # on both limits for a piece or a short border, where chance has more tries
-SHORT = 0.7  # of the height: a border of at most this length counts as a piece
+SHORT_LENGTH = 0.7  # length of a border over the height above the surface, up to which it counts as one piece
 LEVEL_COLUMNS = 32  # on each side of the border: their median depth locates a row
 
 
@@ -146,9 +146,9 @@ def border_cameras(
             along += line.length / 8.0
             continue
         heights.append(height)
-        back = math.cos(TILT) / math.sin(TILT) * height * ahead
+        back = math.cos(TILT_RAD) / math.sin(TILT_RAD) * height * ahead
         for sign in (1.0, -1.0):
-            tilted = sign * math.cos(TILT) * ahead - math.sin(TILT) * plan.up
+            tilted = sign * math.cos(TILT_RAD) * ahead - math.sin(TILT_RAD) * plan.up
             found.append(_placed(_view(middle, plan, sign * ahead, tilted), centre - sign * back))
         found.append(_placed(down, centre))
         along += STATION * height
@@ -175,7 +175,7 @@ def find_seams(
     pieces = 1 + max((response.piece for response in found), default=0)
     strongest: dict[str, tuple[float, Seam]] = {}
     for response in found:
-        part = response.piece >= 0 or line.length < SHORT * height
+        part = response.piece >= 0 or line.length < SHORT_LENGTH * height
         excess = response.excess(*(PIECE_FACTORS if part else (1.0, 1.0)))
         kind = KINDS[response.measure]
         if excess >= 1.0 and excess > strongest.get(kind, (0.0, None))[0]:
@@ -204,7 +204,7 @@ def responses(
     cameras, height = border_cameras(models[0], plan, line, like, options)
     if not cameras:
         return [], height
-    pieces = max(1, int(line.length / (PIECE * height)))
+    pieces = max(1, int(line.length / (PIECE_LENGTH * height)))
     sums: dict[tuple[int, str], Float64[np.ndarray, "p _ k"]] = {}
     counts = np.zeros(pieces + 1, np.int64)  # rows in total, and of each piece
     for camera in cameras:  # summed per image: all rows together would take hundreds of megabytes
@@ -217,11 +217,11 @@ def responses(
             for name, values in _measured(rows.channels, width).items():
                 added = np.stack([values[:, part].sum(axis=1) for part in chosen])
                 sums[width, name] = sums.get((width, name), 0.0) + added
-    shown = np.flatnonzero(counts >= MIN_ROWS).tolist()
+    judged = np.flatnonzero(counts >= MIN_ROWS).tolist()
     found = [
         _response(total[piece] / counts[piece], (name, piece - 1, width), int(counts[piece]))
         for (width, name), total in sums.items()
-        for piece in shown
+        for piece in judged
     ]
     return found, height
 
@@ -271,16 +271,16 @@ def _rows(
     reach = stacks[0].shape[2] // 2
     about = stacks[0][1][:, reach - LEVEL_COLUMNS : reach + LEVEL_COLUMNS]
     about = np.where(about > 0.0, about, np.nan)
-    shown = np.flatnonzero(np.isfinite(about).any(axis=1))
-    level = np.nanmedian(about[shown], axis=1)
-    pixels = np.column_stack([np.full(len(shown), camera.cx), shown + 0.5])
+    image_rows = np.flatnonzero(np.isfinite(about).any(axis=1))
+    level = np.nanmedian(about[image_rows], axis=1)
+    pixels = np.column_stack([np.full(len(image_rows), camera.cx), image_rows + 0.5])
     along = line.along(plan.places(camera.unproject(pixels, level)))
     inside = (along >= 0.0) & (along <= line.length) & (level <= FARTHEST * height)
-    shown, level, along = shown[inside], level[inside], along[inside]
+    image_rows, level, along = image_rows[inside], level[inside], along[inside]
     pixel = (level / camera.fx)[:, None]
-    channels = np.zeros((6, len(shown), 2 * reach))
+    channels = np.zeros((6, len(image_rows), 2 * reach))
     for sign, stack in zip((1.0, -1.0), stacks, strict=True):
-        part = stack[:, shown]
+        part = stack[:, image_rows]
         part[1] = np.where(part[1] > 0.0, part[1] - level[:, None], 0.0) / pixel
         part[2] /= pixel
         channels += sign * part

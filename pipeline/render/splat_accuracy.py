@@ -24,8 +24,10 @@ from splatpipe.pipeline.photos.files.names import NameFinder
 from splatpipe.pipeline.survey.control.residuals import accuracy_table
 from splatpipe.pipeline.survey.crs.frames import Frame, load_frame
 
-ONE_SURFACE = 0.02  # of the depth, between neighbouring pixels: sloping ground has less, an edge far more
-ENOUGH = 3  # held-out photos of a point: with two, a single floater moves the median by half of its distance
+MAX_DEPTH_STEP = 0.02  # relative, between neighbouring pixels of one surface: slopes have less, edges far more
+MIN_HELD_OUT_PHOTOS = (
+    3  # held-out photos of a point: with two, a single floater moves the median by half of its distance
+)
 DIGITS = 5  # decimals of lengths in metres: a hundredth of a millimetre
 POINT_FACTS = ("name", "role", "why", "surveyed_crs", "surveyed_m", "sigma_m", "estimated_m", "residual_m")
 DepthMap = Float[np.ndarray, "h w"]
@@ -163,7 +165,7 @@ def depth_at(depth: DepthMap, pixel: Float64[np.ndarray, " 2"]) -> float | None:
     left, top = (min(max(math.floor(at - 0.5), 0), size - 2) for at, size in zip(pixel, (w, h), strict=True))
     four = depth[max(top, 0) : top + 2, max(left, 0) : left + 2].astype(np.float64)
     nearest = float(depth[row, column])
-    if four.shape != (2, 2) or not (four > 0.0).all() or four.max() > (1.0 + ONE_SURFACE) * four.min():
+    if four.shape != (2, 2) or not (four > 0.0).all() or four.max() > (1.0 + MAX_DEPTH_STEP) * four.min():
         return nearest if nearest > 0.0 and math.isfinite(nearest) else None
     across, down = np.clip(pixel - 0.5 - [left, top], 0.0, 1.0)
     weights = np.outer([1.0 - down, down], [1.0 - across, across])
@@ -173,7 +175,7 @@ def depth_at(depth: DepthMap, pixel: Float64[np.ndarray, " 2"]) -> float | None:
 def _chosen(point: ObservedPoint, held_out: Sequence[str]) -> list[Observation]:
     """The observations in held-out photos; all observations if these are too few for a median."""
     unseen = [seen for seen in point.observations if seen.photo in set(held_out)]
-    return unseen if len(unseen) >= ENOUGH else list(point.observations)
+    return unseen if len(unseen) >= MIN_HELD_OUT_PHOTOS else list(point.observations)
 
 
 def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Frame) -> list[dict[str, Any]]:

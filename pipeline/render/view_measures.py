@@ -23,7 +23,7 @@ from splatpipe.pipeline.splat.quality import metrics
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels shown as the brightest colour, in every image
 EQUAL_DB = 100.0  # stands for the infinite PSNR of identical images: JSON has no infinity
 MASKED_GREY = 128
-MIN_INSIDE = 0.01  # of an image: a photo that shows less inside a boundary is not measured
+MIN_INSIDE_SHARE = 0.01  # share of a photo inside the boundary below which it is not measured
 LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
@@ -50,12 +50,12 @@ def evaluate_view(
     _write_png(stem, "error", error_picture(render, photo, mask))
     if mask is not None:
         _write_png(stem, "mask", np.where(mask, 255, 0).astype(np.uint8))
-    counted = 1.0 if mask is None else round(float(mask.mean()), 6)
+    valid_share = 1.0 if mask is None else round(float(mask.mean()), 6)
     facts = {"name": camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
     figures = measure(render, photo, mask)
-    if inside is not None and counted < MIN_INSIDE:
+    if inside is not None and valid_share < MIN_INSIDE_SHARE:
         figures = dict.fromkeys(figures)
-    return facts | {"counted": counted} | figures | whole
+    return facts | {"counted": valid_share} | figures | whole
 
 
 def shows_inside(area: PlanArea, camera: Camera, depth: Float[np.ndarray, "h w"]) -> Mask:
@@ -82,9 +82,9 @@ def measure(render: Pixels, photo: Pixels, mask: Mask | None) -> dict[str, float
         mask: (h, w), True where pixels count.
     """
     x, y = (torch.from_numpy(pixels.astype(np.float32) / np.float32(255.0)) for pixels in (render, photo))
-    counted = None if mask is None else torch.from_numpy(mask)
+    mask_tensor = None if mask is None else torch.from_numpy(mask)
     try:
-        pair = metrics.pair_of(x, y, counted)
+        pair = metrics.pair_of(x, y, mask_tensor)
     except ValueError:  # no pixel counts
         return dict.fromkeys(metrics.METRICS)
     return {name: _measured(metric, pair) for name, metric in metrics.METRICS.items()}

@@ -34,8 +34,8 @@ POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src blob:; style-src 'self';"
     " img-src 'self' data: blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
 )
-DIGITS = 16  # of a digest, in names: enough to be unique within a site
-CORE = (0.02, 0.98)  # quantiles of the centres along each axis
+DIGEST_CHARACTERS = 16  # hexadecimal digits of a digest in names: enough to be unique within a site
+CORE_QUANTILES = (0.02, 0.98)  # quantiles of the centres along each axis
 SPZ_AXES: Axes = "y up"
 
 
@@ -55,7 +55,7 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
     """
     if splat.facts.axes != "z up":
         raise ValueError(f"a site shows a world that is z up, not {splat.facts.axes}")
-    thumbs = [_thumb_address(shown) for shown in scene.cameras]
+    thumbs = [_thumb_address(camera) for camera in scene.cameras]
     facts = scene_facts(scene, thumbs)
     nodes = list(root.nodes())
     for name in ("nodes", "photos"):
@@ -64,9 +64,9 @@ def write_site(folder: Path, scene: ViewerScene, splat: Scene, root: LevelNode) 
     number = {node: k for k, node in enumerate(nodes)}
     for entry, node in zip(tree, nodes, strict=True):
         entry["children"] = [number[child] for child in node.children]
-    for shown, address in zip(scene.cameras, thumbs, strict=True):
-        if shown.thumb is not None and address is not None:
-            write_file(folder / address, shown.thumb)
+    for camera, address in zip(scene.cameras, thumbs, strict=True):
+        if camera.thumb is not None and address is not None:
+            write_file(folder / address, camera.thumb)
     points, colours = page_points(scene)
     facts["points"] = {
         "address": _write(folder, "points.bin", points.astype("<f4").tobytes() + colours.tobytes()),
@@ -121,7 +121,7 @@ def _core(gaussians: Gaussians) -> Float64[np.ndarray, "2 3"]:
     A node's bounding box encloses whole Gaussians: a few large, far ones in most nodes make it contain the viewpoint.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
-    core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE, axis=0)
+    core: Float64[np.ndarray, "2 3"] = np.quantile(means, CORE_QUANTILES, axis=0)
     return core
 
 
@@ -130,8 +130,8 @@ def _relative_to(gaussians: Gaussians, origin: Float64[np.ndarray, " 3"]) -> Gau
     return Gaussians(means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh)
 
 
-def _thumb_address(shown: ViewerCamera) -> str | None:
-    return None if shown.thumb is None else f"photos/{_digest(shown.thumb)}.jpg"
+def _thumb_address(camera: ViewerCamera) -> str | None:
+    return None if camera.thumb is None else f"photos/{_digest(camera.thumb)}.jpg"
 
 
 def _write(folder: Path, name: str, data: bytes) -> str:
@@ -145,4 +145,4 @@ def _json(value: Mapping[str, Any] | Sequence[Any]) -> bytes:
 
 
 def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:DIGITS]
+    return hashlib.sha256(data).hexdigest()[:DIGEST_CHARACTERS]

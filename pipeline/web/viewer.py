@@ -27,8 +27,8 @@ POLICY = (
     " base-uri 'none'; form-action 'none'"
 )
 MAX_POINTS = 150_000  # in the page, 15 bytes each; more are thinned evenly
-SIZE_QUANTILES = (0.05, 0.95)  # of the sparse points along each axis; they bound the scene
-NEARLY_ALL = 0.9  # of the points in focus: the view need not start from far away because of a few on the far side
+SIZE_QUANTILES = (0.05, 0.95)  # quantiles of the sparse points along each axis that bound the scene
+NEARLY_MOST_SHARE = 0.9  # points in focus, over the most: a few on the far side need not push the view away
 NEAR_PER_SIZE = 1e-3  # near plane as a share of the scene's size, if the caller gives none
 
 
@@ -111,7 +111,7 @@ def viewer_page(scene: ViewerScene, splat: bytes | str) -> str:
     inlined = isinstance(splat, bytes)
     carried = f'<script type="text/plain" id="splat">{_base64(splat)}</script>' if isinstance(splat, bytes) else ""
     points, colours = page_points(scene)
-    facts = scene_facts(scene, [None if shown.thumb is None else _jpeg_address(shown.thumb) for shown in scene.cameras])
+    facts = scene_facts(scene, [None if each.thumb is None else _jpeg_address(each.thumb) for each in scene.cameras])
     facts["points"] = {"xyz": _base64(points.astype("<f4").tobytes()), "rgb": _base64(colours.tobytes())}
     facts["splat"] = {"inlined": inlined, "address": "" if inlined else splat}
     script = asset("viewer.js").replace("</script", "<\\/script").replace("<!--", "<\\!--")
@@ -165,9 +165,9 @@ def start_camera(scene: ViewerScene) -> int:
     if not len(scene.points):
         return 0
     if scene.focus is None or not scene.focus.any():
-        return int(np.argmax([len(shown.camera.in_view(scene.points)[0]) for shown in scene.cameras]))
-    seen = [shown.camera.in_view(scene.points[scene.focus])[2] for shown in scene.cameras]
-    enough = NEARLY_ALL * max(len(depths) for depths in seen)
+        return int(np.argmax([len(viewer_camera.camera.in_view(scene.points)[0]) for viewer_camera in scene.cameras]))
+    seen = [viewer_camera.camera.in_view(scene.points[scene.focus])[2] for viewer_camera in scene.cameras]
+    enough = NEARLY_MOST_SHARE * max(len(depths) for depths in seen)
     return int(np.argmin([np.median(depths) if len(depths) >= max(enough, 1.0) else np.inf for depths in seen]))
 
 
@@ -183,9 +183,11 @@ def scene_facts(scene: ViewerScene, thumbs: Sequence[str | None]) -> dict[str, A
     """
     if not scene.cameras:
         raise ValueError("a viewer needs a camera to begin from")
-    centres = np.array([shown.camera.centre() for shown in scene.cameras])
-    shown = page_points(scene)[0] if scene.focus is None or not scene.focus.any() else scene.points[scene.focus]
-    least, most = np.quantile(shown if len(shown) else centres, SIZE_QUANTILES, axis=0)
+    centres = np.array([each.camera.centre() for each in scene.cameras])
+    visible_points = (
+        page_points(scene)[0] if scene.focus is None or not scene.focus.any() else scene.points[scene.focus]
+    )
+    least, most = np.quantile(visible_points if len(visible_points) else centres, SIZE_QUANTILES, axis=0)
     size = float(np.linalg.norm(most - least)) or 1.0
     return {
         "title": scene.title,
@@ -196,21 +198,21 @@ def scene_facts(scene: ViewerScene, thumbs: Sequence[str | None]) -> dict[str, A
         "size": size,
         "centre": ((least + most) / 2.0).tolist(),
         "start": start_camera(scene),
-        "cameras": [_camera(shown, thumb) for shown, thumb in zip(scene.cameras, thumbs, strict=True)],
+        "cameras": [_camera(each, thumb) for each, thumb in zip(scene.cameras, thumbs, strict=True)],
         "crs": None if scene.crs is None else scene.crs.facts(),
         "sky": None if scene.sky is None else _sky(scene.sky),
     }
 
 
-def _camera(shown: ViewerCamera, thumb: str | None) -> dict[str, Any]:
-    camera = shown.camera
+def _camera(viewer_camera: ViewerCamera, thumb: str | None) -> dict[str, Any]:
+    camera = viewer_camera.camera
     return {
         "name": camera.name,
         **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "rotation": camera.cam_from_world[:3, :3].T.ravel().tolist(),
         "centre": camera.centre().tolist(),
         "thumb": thumb,
-        "held_out": shown.held_out,
+        "held_out": viewer_camera.held_out,
     }
 
 

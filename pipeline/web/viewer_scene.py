@@ -35,7 +35,7 @@ THUMB_HEIGHT, SMALL_THUMB_HEIGHT = 124, 72  # pixels: twice what the page shows;
 MAX_LARGE_THUMBS = 300
 JPEG_QUALITY = 74
 SKY_ROWS = 64  # twice the panorama's, so that the blur of interpolating twice is invisible
-CLEARLY_TILTED = 0.6  # of the up direction, in the image: in steep views from above, no edge is clearly the top
+MIN_UP_LENGTH = 0.6  # length of the up direction in the image: in steep views from above, no edge is clearly the top
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def viewer_rendering(options: RenderOptions, sky: Panorama | None) -> ViewerRend
 def viewer_scene(
     dataset: Path,
     frame: Frame,
-    look: ViewerRendering,
+    rendering: ViewerRendering,
     held_out: Collection[str] = (),
     gaussians: int = 0,
     title: str = "3D model",
@@ -84,10 +84,10 @@ def viewer_scene(
     views, points = load_views(dataset), load_points(dataset)
     in_world = frame.world_from_model.apply(points.xyz)
     height = THUMB_HEIGHT if len(views) <= MAX_LARGE_THUMBS else SMALL_THUMB_HEIGHT
-    cameras = tuple(_shown(view, frame, height, view.camera.name in held_out) for view in views)
+    cameras = tuple(_viewer_camera(view, frame, height, view.camera.name in held_out) for view in views)
     crs = None
     if frame.origin is not None:
-        centres = np.array([shown.camera.centre() for shown in cameras]).reshape(-1, 3)
+        centres = np.array([viewer_camera.camera.centre() for viewer_camera in cameras]).reshape(-1, 3)
         crs = local_crs(open_world(frame), scene_box(in_world, centres))
     return ViewerScene(
         title=title,
@@ -98,10 +98,10 @@ def viewer_scene(
         metres=frame.in_metres,
         placed=frame.origin is not None,
         crs=crs,
-        antialias=look.antialias,
-        background=look.background,
-        near=look.near * float(frame.world_from_model.scale),
-        sky=None if look.sky is None else _sky(look.sky, frame),
+        antialias=rendering.antialias,
+        background=rendering.background,
+        near=rendering.near * float(frame.world_from_model.scale),
+        sky=None if rendering.sky is None else _sky(rendering.sky, frame),
         note=frame.note,
     )
 
@@ -141,7 +141,7 @@ def upright(camera: Camera) -> tuple[Camera, int]:
         The camera of the rotated image, and the number of anticlockwise quarter turns, as for ``np.rot90``.
     """
     up_right, up_down = float(camera.cam_from_world[0, 2]), float(camera.cam_from_world[1, 2])
-    if math.hypot(up_right, up_down) < CLEARLY_TILTED:
+    if math.hypot(up_right, up_down) < MIN_UP_LENGTH:
         return camera, 0
     turns = round(math.atan2(up_right, -up_down) / (math.pi / 2.0)) % 4
     for _ in range(turns):
@@ -164,7 +164,7 @@ def _quarter(camera: Camera) -> Camera:
     )
 
 
-def _shown(view: View, frame: Frame, height: int, held_out: bool) -> ViewerCamera:
+def _viewer_camera(view: View, frame: Frame, height: int, held_out: bool) -> ViewerCamera:
     camera, turns = upright(_in_world(view.camera, frame))
     size = (view.camera.width, view.camera.height)
     picture = np.rot90(read_small(view.image_path, size, (height, height))[1], turns)

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from splatpipe.pipeline.edit.floaters.floaters import LOOKS, LOOSE, Suspects, likely_floaters
+from splatpipe.pipeline.edit.floaters.floaters import LOOSE, PASSES, Suspects, likely_floaters
 from splatpipe.pipeline.edit.floaters.isolation import GaussianShapes, far_groups, held
 from splatpipe.pipeline.edit.floaters.visibility import GaussianVisibility, TrainingPhotos, measure_visibility
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
@@ -32,8 +32,8 @@ FAINT = 0.03  # opacity negligible where no photo shows it: seven steps of an 8-
 SOLID = 0.1  # least opacity of solid objects: haze holds nothing
 SEEN_PIXELS = 1.0  # visible pixels, over all photos, that make a Gaussian count as seen
 UNSEEN_PIXELS = 0.1
-FLOATING = 0.5  # share of a Gaussian's visible area that lies in front of everything around it
-SUSPECTED = 0.3  # the same if images decide: most of these are real, and the images keep them
+FLOATING_SHARE = 0.5  # share of a Gaussian's visible area that lies in front of everything around it
+SUSPECTED_SHARE = 0.3  # visible share in front of everything that gets tested on images: most of these are real
 FEW_PHOTOS = 2.0  # that see a loose Gaussian: training can put anything in front of a single photo
 OVERSIZED = 0.2  # times the distance to the nearest camera: a floating Gaussian's large standard deviation
 HAZE = 0.3  # opacity below which a very large Gaussian is not an object, if there are no photos to tell
@@ -100,11 +100,11 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
         yield "oversized", _haze(shapes, opacity)
         yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
         return
-    looks = len(photos.cameras)
-    steps = looks + (0 if photos.picture is None else LOOKS * len(photos.looked_at))
+    photo_count = len(photos.cameras)
+    steps = photo_count + (0 if photos.picture is None else PASSES * len(photos.compared_photos))
     found = measure_visibility(gaussians, photos, lambda done: on_progress(done, steps))
     seen = found.weight >= SEEN_PIXELS
-    floats = seen & (found.floating > FLOATING)
+    floats = seen & (found.floating > FLOATING_SHARE)
     ground = seen & ~floats & solid
     loose = floats & ~held(shapes, LOOSE, ground, floats & solid)
     large = floats & _oversized(shapes, photos)
@@ -115,9 +115,9 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
     if photos.picture is None:
         yield "floating", loose & solid & ~large  # large ones may be all that represents the far background
         return
-    suspected = seen & (found.floating > SUSPECTED) & (found.compared >= SEEN_PIXELS)
+    suspected = seen & (found.floating > SUSPECTED_SHARE) & (found.compared >= SEEN_PIXELS)
     suspects = Suspects(gaussians, shapes, suspected, seen & ~suspected & solid, found)
-    floaters = likely_floaters(suspects, photos, lambda done: on_progress(looks + done, steps))
+    floaters = likely_floaters(suspects, photos, lambda done: on_progress(photo_count + done, steps))
     yield "oversized", floaters & large
     yield "floating", floaters
     on_progress(steps, steps)

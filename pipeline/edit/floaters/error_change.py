@@ -63,12 +63,14 @@ def error_change_in_photos(
     options = replace(photos.options, depth=False, magnitudes=False)
     wanted = torch.from_numpy(asked).to(gaussians.means.device)
     opacity = torch.sigmoid(gaussians.opacity_logits.detach())
-    shown = torch.where(wanted, HALFWAY * opacity, opacity)
-    logits = torch.logit(shown).requires_grad_()
+    halved_opacity = torch.where(wanted, HALFWAY * opacity, opacity)
+    logits = torch.logit(halved_opacity).requires_grad_()
     halfway = replace(gaussians.detach(), opacity_logits=logits)
-    per_logit = torch.where(wanted, opacity / (shown * (1.0 - shown)), torch.zeros(()).to(opacity)).numpy(force=True)
+    per_logit = torch.where(
+        wanted, opacity / (halved_opacity * (1.0 - halved_opacity)), torch.zeros(()).to(opacity)
+    ).numpy(force=True)
     better, worse = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), np.float32)
-    for done, index in enumerate(photos.looked_at, start=1):
+    for done, index in enumerate(photos.compared_photos, start=1):
         colour = _rendered(halfway, photos.cameras[index], photos, options)
         downhill = _error_slope(colour, *photos.picture(index))
         (slope,) = torch.autograd.grad(colour, logits, downhill)

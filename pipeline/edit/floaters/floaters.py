@@ -32,9 +32,9 @@ LIMITS = ((0.02, 0.05), (0.008, 0.015), (0.003, 0.005))
 """Limits per pass on the change of a pixel's squared error (0..3) per unit of a Gaussian's weight. A Gaussian that
 worsens the photos by more than the first is left out of later passes, since it makes what is behind it look bad; one
 that improves them by more than the second is cleared and rendered at full opacity."""
-LOOKS = len(LIMITS) + 1  # passes over all photos: likely floaters get one more, by themselves
+PASSES = len(LIMITS) + 1  # passes over all photos: likely floaters get one more, by themselves
 MIN_GAP = 0.003  # share of the depth: the accuracy of the gap
-NOISE = 1.0 / 30.0  # of one pixel's summed squared errors; it grows with the square root of the number of pixels
+PIXEL_NOISE = 1.0 / 30.0  # noise of one pixel's summed squared error (colours 0 to 1); over n pixels it grows with √n
 EVIDENCE = {
     "worse on the whole": 1.45,
     "worse in some": 1.4,
@@ -86,7 +86,7 @@ def likely_floaters(suspects: Suspects, photos: TrainingPhotos, on_progress: Cal
     Args:
         suspects: The suspects and what is known of them.
         photos: The training photos, with images.
-        on_progress: Called with the number of images processed, at most ``LOOKS`` times that of photos compared.
+        on_progress: Called with the number of images processed, at most ``PASSES`` times that of photos compared.
     """
     if suspects.ground.sum() <= NEIGHBOURS:
         return np.zeros(len(suspects.ground), np.bool_)  # not enough of a scene for anything to float in front of
@@ -95,8 +95,8 @@ def likely_floaters(suspects: Suspects, photos: TrainingPhotos, on_progress: Cal
     likely = np.asarray(suspects.suspected & (odds > 0.0))
     if not likely.any():
         return likely
-    looks = len(LIMITS) * len(photos.looked_at)
-    worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, on_progress, looks))
+    done_before = len(LIMITS) * len(photos.compared_photos)
+    worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, on_progress, done_before))
     missed = (worth.better - worth.worse) / _pixels(suspects) > LIMITS[-1][1]
     return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # a loose one may hide other floaters
 
@@ -109,7 +109,7 @@ def _pixels(suspects: Suspects) -> Figures:
 def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
     """The features of the logistic regression by name, as in ``EVIDENCE``."""
     suspected, seen = suspects.suspected, suspects.sightings
-    noise = NOISE * np.sqrt(_pixels(suspects))
+    noise = PIXEL_NOISE * np.sqrt(_pixels(suspects))
     loose, light = (
         suspected & ~held(suspects.shapes, touch, suspects.ground, suspected) for touch in (LOOSE, LIGHTLY_HELD)
     )
@@ -129,21 +129,21 @@ def verdicts_of(suspects: Suspects, photos: TrainingPhotos, on_progress: Callabl
     gaussians, pixels = suspects.gaussians, _pixels(suspects)
     n = len(gaussians)
     worse, better, least = np.zeros(n, np.float32), np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
-    shown, asked = np.ones(n, np.bool_), suspects.suspected.copy()
+    remaining, asked = np.ones(n, np.bool_), suspects.suspected.copy()
     for number, (bad, good) in enumerate(LIMITS):
         if not asked.any():
             break
-        rows = np.flatnonzero(shown)
+        rows = np.flatnonzero(remaining)
         model = gaussians if len(rows) == n else gaussians.select(torch.from_numpy(rows).to(gaussians.means.device))
-        looks = number * len(photos.looked_at)
-        worth = error_change_in_photos(model, asked[rows], photos, partial(_after, on_progress, looks))
+        done_before = number * len(photos.compared_photos)
+        worth = error_change_in_photos(model, asked[rows], photos, partial(_after, on_progress, done_before))
         of_pixel = np.full(n, np.inf, np.float32)
         of_pixel[rows] = (worth.better - worth.worse) / pixels[rows]
         lower = asked[rows] & (of_pixel[rows] < least[rows])
         least[rows[lower]] = of_pixel[rows[lower]]
         worse[rows[lower]], better[rows[lower]] = worth.worse[lower], worth.better[lower]
-        shown &= ~(asked & (of_pixel < -bad))
-        asked &= shown & (of_pixel <= good)
+        remaining &= ~(asked & (of_pixel < -bad))
+        asked &= remaining & (of_pixel <= good)
     return Verdicts(worse, better)
 
 

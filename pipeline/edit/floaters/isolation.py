@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 NEIGHBOURS = 12  # nearest neighbours of each Gaussian that are tested for contact
-GAP_SIGMAS = 4.0  # of an isolated Gaussian's own size: Gaussians of a surface lie closer to each other
+MAX_GAP_SIGMAS = 4.0  # farther from the scene, in a Gaussian's own sigmas, it is isolated: surfaces lie closer
 CHUNK = 1 << 16  # Gaussians at a time: tens of megabytes
 
 
@@ -93,9 +93,9 @@ def far_groups(
 def _near(
     shapes: GaussianShapes, touch: TouchRule, asked: Int64[np.ndarray, " m"], scene: Int64[np.ndarray, " s"]
 ) -> Bool[np.ndarray, " m"]:
-    """Which Gaussians are near the scene: they touch it, or are within ``GAP_SIGMAS`` of it."""
+    """Which Gaussians are near the scene: they touch it, or are within ``MAX_GAP_SIGMAS`` of it."""
     distance = cKDTree(shapes.centres[scene]).query(shapes.centres[asked])[0]
-    return np.asarray(touch_any(shapes, touch, asked, scene) | (distance <= GAP_SIGMAS * shapes.largest[asked]))
+    return np.asarray(touch_any(shapes, touch, asked, scene) | (distance <= MAX_GAP_SIGMAS * shapes.largest[asked]))
 
 
 def held(

@@ -26,10 +26,10 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sh import C0
 from splatpipe.pipeline.splat.sky.panorama import Panorama
 
-MIN_SEEN = 1e-3  # of a pixel: less is rounding
+MIN_VISIBLE_PX = 1e-3  # visible area in one photo, pixels, below which a Gaussian is not seen: less is rounding
 BORDER_SHARE = 0.08  # width of the border as a share of an image's shorter side: seen only there is hardly covered
-BEFORE_SHARE = 0.005  # of the depth: how far a Gaussian must be in front of the background, the depths' accuracy
-BEFORE_SIGMAS = 2.0  # the same in its own standard deviations along the view axis
+IN_FRONT_SHARE = 0.005  # a Gaussian floats if it is that much, relative to the depth, in front of the background,
+IN_FRONT_SIGMAS = 2.0  # and its least distance to it in its standard deviations along the view axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class TrainingPhotos:
     compared: Sequence[int] | None = None
 
     @property
-    def looked_at(self) -> Sequence[int]:
+    def compared_photos(self) -> Sequence[int]:
         """Indices of the photos that suspects are compared with."""
         return range(len(self.cameras)) if self.compared is None else self.compared
 
@@ -112,15 +112,15 @@ def measure_visibility(
     grey = grey_of(gaussians)
     plain = replace(photos.options, sh_degree=0, depth=True, magnitudes=False)
     centres, axes = gaussians.means.detach().numpy(force=True), half_axes(gaussians)
-    sums, looked_at = _VisibilitySums(len(gaussians)), set(photos.looked_at)
+    sums, compared_indices = _VisibilitySums(len(gaussians)), set(photos.compared_photos)
     for index, camera in enumerate(photos.cameras):
         rendered = rasterizer.render(grey, camera, plain)
         behind = without_islands(rendered.median_depth.numpy(force=True))
         picture = np.stack([np.ones_like(behind), _border(camera), behind], axis=2)
         found = weights_of(rendered, grey, picture)
-        rows = np.flatnonzero(found[:, 0] > MIN_SEEN)
+        rows = np.flatnonzero(found[:, 0] > MIN_VISIBLE_PX)
         _add(sums, rows, found[rows], camera, (centres[rows], axes[rows]))
-        if index in looked_at:
+        if index in compared_indices:
             sums.compared[rows] += found[rows, 0]
         on_progress(index + 1)
     return sums.sightings()
@@ -163,7 +163,7 @@ def _add(
     depths = camera.depths(centres.astype(np.float64)).astype(np.float32)
     spread = np.linalg.norm(np.einsum("mij,i->mj", axes, camera.cam_from_world[2, :3].astype(np.float32)), axis=1)
     behind = behind / weight
-    is_before = behind - depths > np.maximum(BEFORE_SHARE * depths, BEFORE_SIGMAS * spread)
+    is_before = behind - depths > np.maximum(IN_FRONT_SHARE * depths, IN_FRONT_SIGMAS * spread)
     area = weight * depths * depths / np.float32(camera.fx * camera.fy)
     sums.weight[rows] += weight
     sums.square[rows] += weight * weight

@@ -40,7 +40,7 @@ POLL_S = 0.25
 MAX_SIGNATURE_BYTES = 4096  # bytes read of a signature
 WIDTH = 1024  # bytes to which signatures are padded: of two written over each other, the last is intact
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # the same in all containers of a machine
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # identifies a machine's boot, in all of its containers alike
 
 Notify = Callable[[str], None]
 
@@ -153,7 +153,7 @@ def locked(out: Path, *, folder: str = "stages", wait: bool = False, notify: Not
     hold = _acquire(path, notify, wait=wait)
     try:
         for shard in sorted(path.parent.glob(f"{LOCK_FILE}.*")):
-            if _read_signature(shard) is not None:  # of a killed process, or of a machine that does not see our lock
+            if _read_signature(shard) is not None:  # left by a killed process, or held where our lock is not seen
                 _acquire(shard, notify, wait=wait).close()
         yield hold
     finally:

@@ -25,7 +25,7 @@ from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.files.output_file import is_inside, own_folder, require_own_files
 from splatpipe.pipeline.engine.stage import JSON, Stage, Summary
 
-FORMAT = 1  # of the layout of OUT; raised when older versions could no longer read it
+FORMAT = 1  # version of the layout of OUT; raised when older versions could no longer read it
 KEY_CHARACTERS = 16  # in a folder's name: 64 bits are enough for the few artifacts of one OUT
 MIN_FREE_BYTES = 16 << 20
 MANIFEST = "manifest.json"
@@ -67,7 +67,7 @@ class Artifact:
         """The files of the stage's deliverables by path relative to OUT, as its manifest lists them."""
         files: dict[Path, Path] = {}
         for name in stage.deliverables:
-            if name not in self.manifest["parts"]:  # of an older version
+            if name not in self.manifest["parts"]:  # an artifact of an older version, which had no such part
                 continue
             part = self.manifest["parts"][name]
             root = PurePosixPath(part["path"])
@@ -242,7 +242,7 @@ class Store:
         for name, file in wanted.items():
             if not is_copy(file, self.out / name) or not is_inside(self.out, name):
                 folder = own_folder(self.out, name.parent)
-                remove_unfinished(folder, name.name)  # of a killed run: only the lock's holder delivers
+                remove_unfinished(folder, name.name)  # left by a killed run: only the lock's holder delivers
                 copy_durably(file, self.out / name)
         for earlier in self.artifacts(stage.name):
             for name, file in earlier.deliverables(stage).items():

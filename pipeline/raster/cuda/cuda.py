@@ -87,13 +87,13 @@ class CudaKernels:
         with torch.cuda.device(self.device) if self.device.type == "cuda" else nullcontext():
             self._library.call(name, *arguments, ctypes.byref(self.stream()))
 
-    def frame_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+    def frame_bytes(self, view: SplatShot, count: int, capacity: int) -> int:
         """Memory of a frame, from its render onward, bytes."""
-        return self._library.size("splat_frame_bytes", ctypes.byref(shot), count, capacity)
+        return self._library.size("splat_frame_bytes", ctypes.byref(view), count, capacity)
 
-    def back_bytes(self, shot: SplatShot, count: int, capacity: int) -> int:
+    def back_bytes(self, view: SplatShot, count: int, capacity: int) -> int:
         """Additional memory of its backward pass, bytes."""
-        return self._library.size("splat_back_bytes", ctypes.byref(shot), count, capacity)
+        return self._library.size("splat_back_bytes", ctypes.byref(view), count, capacity)
 
     def photo_loss(
         self,

@@ -20,7 +20,7 @@ FIRST_PASSES = 8  # once: a wrong guess then costs empty launches, and the launc
 MARGIN = 1.25  # over the recent maximum: views differ, and the model grows
 WINDOW = 512  # frames after which older maxima start to be forgotten: more than most trainings have photos
 PAIR_BYTES = 64  # per pair, in the frame and its backward pass
-MEMORY_SHARE = 1 / 16  # of the device's memory for pairs: several chunks are binned twice, so prefer a single one
+MEMORY_SHARE = 1 / 16  # share of the device's memory for pairs: several chunks are binned twice, so prefer a single one
 FEWEST_PAIRS, MAX_PAIRS = 1 << 22, 1 << 28  # at a time: for a small device, filling it; and 17 GB of them
 STEPS_AN_OCTAVE = 8  # sizes that capacities are rounded up to, so that torch's allocator reuses the last frame's memory
 MAX_TILES = 1 << 16  # per chunk, as in frame.h
@@ -110,7 +110,7 @@ class Forecast:
         self.most_pairs = most_pairs
         self._readings: deque[PendingFacts] = deque()
         self._recent: FrameFacts | None = None  # the most of this window's frames
-        self._before: FrameFacts | None = None  # of the one before it
+        self._before: FrameFacts | None = None  # the most of the preceding window's frames
         self._seen = 0  # frames in this window
         self._last = FrameAllocation(0, 0)
         self._last_count = 0

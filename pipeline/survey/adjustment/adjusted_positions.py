@@ -68,7 +68,7 @@ def adjust_model(capture: GeorefInput, frame: Frame, report: Reporter) -> Adjust
         report.warning(f"The positions place the model, but cannot adjust it: {error}.", "Is the sparse model sound?")
         return None
     sizes = np.median(done.noise.sizes(done.positions), axis=0)
-    if not done.adjusted.settled or float(sizes.max()) > ACCURATE_M:
+    if not done.adjusted.converged or float(sizes.max()) > ACCURATE_M:
         return None  # not what they are stated to be: the similarity says so
     moved = moved_px(model.reconstruction, done.reconstruction)
     return AdjustedPositions(done, moved, moved >= MIN_DEFORMATION_PX, names, flights_of(names, capture.positions))

@@ -32,8 +32,8 @@ from splatpipe.pipeline.survey.adjustment.block_lens import Lens
 from splatpipe.pipeline.survey.adjustment.tie_points import TieTable, whole_model
 
 UNBOUND_M = 1e4  # sigma of a height that was not measured
-HELD_SHARE = 0.01  # of a focal length that nothing determines, about its prior
-ROUNDS = 10  # of reweighting
+HELD_FOCAL_SIGMA = 0.01  # sigma of a focal length that nothing determines, relative to its prior
+ROBUST_ROUNDS = 10  # rounds of reweighting of the similarity
 
 
 @dataclass(frozen=True)
@@ -218,10 +218,10 @@ def _focal_sigmas(done: AdjustedBlock, observed: PositionObservations, cameras: 
 
 
 def _near(lens: Lens, focal_px: float) -> Lens:
-    """A lens that starts at a focal length and stays within three times ``HELD_SHARE`` of it."""
+    """A lens that starts at a focal length and stays within three times ``HELD_FOCAL_SIGMA`` of it."""
     at = lens.names.index("f")
     mean, sigmas, step = lens.mean.copy(), lens.sigmas.copy(), np.zeros(len(lens.names))
-    mean[at], sigmas[at], step[at] = focal_px, HELD_SHARE * focal_px, focal_px - lens.values[at]
+    mean[at], sigmas[at], step[at] = focal_px, HELD_FOCAL_SIGMA * focal_px, focal_px - lens.values[at]
     return replace(lens.moved(step), mean=mean, sigmas=sigmas)
 
 
@@ -239,7 +239,7 @@ def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) ->
     old = np.array([before.points3D[number].xyz for number in numbers])
     new = np.array([after.points3D[number].xyz for number in numbers])
     weights = np.ones(len(numbers))
-    for _ in range(ROUNDS):  # distant points are seen by few photos, and would rotate the fit
+    for _ in range(ROBUST_ROUNDS):  # distant points are seen by few photos, and would rotate the fit
         scale, rotation, translation = fit_similarity(new, old, weights)
         back = Similarity(float(scale), rotation, translation).apply(new)
         distance = np.linalg.norm(back - old, axis=1)
@@ -252,7 +252,7 @@ def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) ->
         if not seen:
             continue
         camera, pose = before.cameras[image.camera_id], image.cam_from_world().matrix()
-        shown = [project_through_lens(camera, pose, xyz[seen])[0] for xyz in (old, back)]
-        squares.append(((shown[1] - shown[0]) ** 2).sum(axis=1))
+        projected = [project_through_lens(camera, pose, xyz[seen])[0] for xyz in (old, back)]
+        squares.append(((projected[1] - projected[0]) ** 2).sum(axis=1))
     together = np.concatenate(squares)
     return float(np.sqrt(together[np.isfinite(together)].mean()))

@@ -26,12 +26,12 @@ from splatpipe.pipeline.survey.adjustment.block_adjustment import (
 from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
 GROUND_POINTS = 400  # at which the ground's accuracy is evaluated
-MIN_VIEWS = 3  # of such a point
+MIN_VIEWS = 3  # photos that show a point of the ground at which accuracy is evaluated
 MAX_PHOTOS = 500  # whose covariance is propagated together
-FAR = 2.0  # times the median distance from camera to point: the background is not the site
+FAR_RATIO = 2.0  # times the median distance from camera to point: the background is not the site
 MARK_SIGMA_PX = 0.5
 CONTROL_SIGMAS_M = (0.02, 0.02, 0.03)
-OTHER_HEIGHT = 0.25  # of the flying height, by which a cross strip is flown higher
+CROSS_STRIP_RISE = 0.25  # height of a cross strip over the other flights', as a share of the flying height
 MAX_CROSS = 12  # photos of a cross strip
 
 
@@ -90,7 +90,7 @@ def accuracy_of(adjusted: AdjustedBlock, observed: PositionObservations) -> Bloc
     views = np.bincount(block.point, minlength=len(block.points))
     away = np.linalg.norm(block.points[block.point] - block.centres[block.photo], axis=1)
     distance = np.bincount(block.point, weights=away, minlength=len(views)) / np.maximum(views, 1)
-    near = distance <= FAR * float(np.median(away)) if len(away) else np.ones(0, dtype=bool)
+    near = distance <= FAR_RATIO * float(np.median(away)) if len(away) else np.ones(0, dtype=bool)
     seen = np.flatnonzero((views >= MIN_VIEWS) & (block.weights[:, 0] == 0.0) & near)
     chosen = seen[:: max(1, math.ceil(len(seen) / GROUND_POINTS))]
     return BlockAccuracy(
@@ -175,8 +175,8 @@ def with_control(accuracy: BlockAccuracy, counts: Sequence[int] = (1, 3)) -> dic
         spread = np.einsum("kaq,kbq->kab", carried, accuracy.carry, optimize=True) + survey
         crossed = carried @ mean  # (k, 3)
         gains = np.einsum("ka,ka->k", crossed, np.linalg.solve(spread, crossed[:, :, None])[:, :, 0])
-        ranked = gains - 1e9 * np.array([tuple(place) in places for place in accuracy.places.tolist()])
-        best = int(np.argmax(ranked)) if count == 1 else _farthest(accuracy, ranked, places)
+        scores = gains - 1e9 * np.array([tuple(place) in places for place in accuracy.places.tolist()])
+        best = int(np.argmax(scores)) if count == 1 else _farthest(accuracy, scores, places)
         places.append(tuple(accuracy.places[best].tolist()))
         covariance = covariance - carried[best].T @ np.linalg.solve(spread[best], carried[best])
         if count in counts:
@@ -185,11 +185,11 @@ def with_control(accuracy: BlockAccuracy, counts: Sequence[int] = (1, 3)) -> dic
 
 
 def _farthest(
-    accuracy: BlockAccuracy, ranked: Float64[np.ndarray, " k"], places: Sequence[tuple[float, float, float]]
+    accuracy: BlockAccuracy, scores: Float64[np.ndarray, " k"], places: Sequence[tuple[float, float, float]]
 ) -> int:
     """Of the points, the one farthest from those chosen: control belongs around the site."""
     away = np.min([np.linalg.norm(accuracy.places[:, :2] - np.array(place)[:2], axis=1) for place in places], axis=0)
-    return int(np.argmax(np.where(ranked > -1e8, away, -1.0)))
+    return int(np.argmax(np.where(scores > -1e8, away, -1.0)))
 
 
 def with_cross_strip(accuracy: BlockAccuracy) -> Remedy | None:
@@ -241,21 +241,21 @@ def _with_strip(block: Block) -> Block | None:
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     rotation = block.rotations[first] @ turn.T
     along = np.linspace(-reach, reach, count)[:, None] * axes[1]
-    centres = np.column_stack([middle + along, np.full(count, ground + (1.0 + OTHER_HEIGHT) * height)])
+    centres = np.column_stack([middle + along, np.full(count, ground + (1.0 + CROSS_STRIP_RISE) * height)])
     lens = block.lenses[int(block.lens_of[first])]
     photo, point, pixels = [], [], []
     for k, centre in enumerate(centres):
         rays = (block.points - centre) @ rotation.T
         ahead = rays[:, 2] > 0.1
-        shown = np.full((len(rays), 2), np.nan)
-        shown[ahead] = np.asarray(lens.camera.img_from_cam(rays[ahead]), np.float64)
+        projected = np.full((len(rays), 2), np.nan)
+        projected[ahead] = np.asarray(lens.camera.img_from_cam(rays[ahead]), np.float64)
         size = np.array([lens.camera.width, lens.camera.height])
         slope = np.hypot(rays[:, 0], rays[:, 1]) < 1.5 * np.maximum(rays[:, 2], 1e-9)
-        inside = ((shown > 0.0) & (shown < size)).all(axis=1) & slope
+        inside = ((projected > 0.0) & (projected < size)).all(axis=1) & slope
         seen = np.flatnonzero(inside)
         photo.append(np.full(len(seen), len(block) + k))
         point.append(seen)
-        pixels.append(shown[seen])
+        pixels.append(projected[seen])
     order = np.argsort(np.concatenate([block.point, *point]), kind="stable")
     added = sum(map(len, point))
     return replace(

@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64
 from splatpipe.pipeline.survey.adjustment.block import Block, Normal, ReducedBlock, reduce_block, settle_points
 
 ROUNDS = 60
-SETTLED = 1e-3  # decrease of the sum of squares: a thirtieth of a standard deviation
+MIN_DECREASE = 1e-3  # decrease of the sum of squares: a thirtieth of a standard deviation
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 EASIER, HARDER = 0.1, 10.0
 
@@ -60,14 +60,14 @@ class AdjustedBlock:
         offsets: Each flight's common error, stated less true, metres.
         reduced: Its normal equations there, without the positions.
         cost: The sum of squares.
-        settled: Whether the minimum was reached.
+        converged: Whether the minimum was reached.
     """
 
     block: Block
     offsets: Float64[np.ndarray, "g 3"]
     reduced: ReducedBlock
     cost: float
-    settled: bool
+    converged: bool
 
 
 def adjust_block(
@@ -86,15 +86,15 @@ def adjust_block(
     """
     if offsets is None:
         offsets = np.zeros_like(positions.offset_sigmas)
-    cost, damping, settled = block.cost() + positions.cost(block, offsets), DAMPING, False
+    cost, damping, converged = block.cost() + positions.cost(block, offsets), DAMPING, False
     reduced = reduce_block(block)
     for _ in range(ROUNDS):
         poll()
         normal, gradient = joint_system(reduced, positions, block, offsets)
         step = solve(_damped(normal, damping), -gradient)
         gain = -float(gradient @ step)
-        if gain < SETTLED:
-            settled = True
+        if gain < MIN_DECREASE:
+            converged = True
             break
         moved = block.moved(step[: block.unknowns], block.points + reduced.points_after(step[: block.unknowns]))
         moved = settle_points(moved)
@@ -103,16 +103,16 @@ def adjust_block(
 
         if after < cost:
             block, offsets, damping = moved, shifted, max(EASIER * damping, LEAST_DAMPING)
-            settled = cost - after < SETTLED
+            converged = cost - after < MIN_DECREASE
             cost = after
             reduced = reduce_block(block)
-            if settled:
+            if converged:
                 break
         elif damping > MOST_DAMPING:
             break
         else:
             damping *= HARDER
-    return AdjustedBlock(block, offsets, reduced, cost, settled)
+    return AdjustedBlock(block, offsets, reduced, cost, converged)
 
 
 def joint_system(

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.sfm.lenses.lens_model import NAMES
 
-LENS_STEP = 1e-3  # of central differences, pixels at the corner
+LENS_STEP = 1e-3  # step of central differences with respect to a lens parameter, pixels at the image's corner
 LENGTHS = frozenset({"f", "cx", "cy"})  # parameters in pixels
 RAY_STEP = 1e-5
 MIN_DEPTH = 1e-6  # metres in front of a camera

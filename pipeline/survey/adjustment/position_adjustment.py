@@ -27,8 +27,8 @@ from splatpipe.pipeline.survey.adjustment.position_noise import (
     centre_system,
     estimate_noise,
     find_blunders,
+    noise_with_drift,
     predicted_errors,
-    settled_noise,
     strip_pieces,
     with_drift_of,
 )
@@ -54,16 +54,16 @@ ALL_FISHEYE = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "k4")
 FOCAL_SHARES = {"lens-file": 0.003, "xmp-dewarp": 0.01, "xmp-calibrated": 0.01, "guess": 0.3}
 OTHER_FOCAL_SHARE = 0.03
 FOCAL_SHARE = 0.03  # standard deviation of a focal length about its prior, relative, without positions
-DISTORTION_SIGMA = 0.2  # likewise of a coefficient about its estimate from SfM
+DISTORTION_SIGMA = 0.2  # standard deviation of a distortion coefficient about its estimate from SfM
 FIXED = ("k4", "k5", "k6")  # the denominator of FULL_OPENCV
 WEAK = {"k1": 0.3, "k2": 0.3, "k3": 0.3, "k4": 0.3, "p1": 0.01, "p2": 0.01, "aspect": 0.005}
-CENTRE_SHARE = 0.02  # of the width: standard deviation of a principal point
-MIN_PHOTOS = 8  # of a camera whose lens is freed
-ROUNDS = 4  # of adjustment, noise and blunders
+CENTRE_SHARE = 0.02  # standard deviation of a principal point, as a share of the image's width
+MIN_PHOTOS = 8  # photos a camera needs for its lens to be freed
+MAX_ROUNDS = 4  # rounds of adjustment, noise and blunders
 HELD_OUT = 600  # tie points that judge the lens
 CAP = 4.0  # times the median error of such a point: a wrong match must not decide
 WORSE = 0.01  # relative, of predictions by a lens that is refused
-SETTLED = 0.03  # relative change of the noise
+MIN_RELATIVE_CHANGE = 0.03  # relative change of the noise
 
 
 def quietly(done: int, total: int) -> None:
@@ -360,7 +360,7 @@ def converge(
     noise = as_stated(positions.only(kept))
     offsets = None
     adjusted = adjust_block(block, noise.observations(positions.only(kept)), offsets)
-    for done in range(ROUNDS):
+    for done in range(MAX_ROUNDS):
         poll(min(2 + done, 4), 6)
         found = np.ones(len(positions), dtype=bool)
         for part in parts_of(adjusted, positions):
@@ -372,7 +372,7 @@ def converge(
         before, noise = noise, _noise_of(adjusted, used)
         adjusted = adjust_block(adjusted.block, noise.observations(used), adjusted.offsets)
         same = before.factors.shape == noise.factors.shape and len(before.of) == len(noise.of)
-        if same and np.abs(before.factors / noise.factors - 1.0).max() < SETTLED:
+        if same and np.abs(before.factors / noise.factors - 1.0).max() < MIN_RELATIVE_CHANGE:
             break
     return BlockFit(adjusted, positions, kept, noise)
 
@@ -387,7 +387,7 @@ def _noise_of(adjusted: AdjustedBlock, positions: StatedPositions) -> PositionNo
     every = as_stated(positions)
     factors, weights = np.zeros_like(every.factors), np.zeros(len(every.classes))
     for part in parts:
-        found = noise if part is middle else settled_noise(part.system, part.block, part.positions, noise)
+        found = noise if part is middle else noise_with_drift(part.system, part.block, part.positions, noise)
         for own, name in enumerate(found.classes):
             at = every.classes.index(name) if name in every.classes else len(every.classes) - 1
             count = float((found.of == own).sum())

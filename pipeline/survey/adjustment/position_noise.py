@@ -31,16 +31,16 @@ MAX_CHAIN = 200  # neighbours along a flight whose drift is modelled together
 MIN_CLASS = 10  # positions with a factor of their own
 PRIOR_DEGREES = 2.0  # weight of the stated standard deviation, for few positions
 LITTLE = 0.2  # its weight for many
-FEW_DEGREES = 10.0  # of freedom: fewer do not tell a factor, and the other direction's counts
+FEW_DEGREES = 10.0  # degrees of freedom below which a direction's factor is uncertain, and the other direction's counts
 FACTOR_ROUNDS = 12
-SETTLED = 0.01  # relative, of a factor
+MIN_RELATIVE_CHANGE = 0.01  # relative, of a factor
 MIN_FACTOR = 0.05
 ROBUST_ROUNDS = 30
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
-MEDIAN_NORM = 1.538  # of three standard normal coordinates
+MEDIAN_NORM = 1.538  # median norm of three standard normal coordinates
 BLUNDER_NOISES = 6.0  # times the noise of its class, as its root mean square along the axes
 BLUNDER_STATED = 3.0  # times the stated standard deviation: a smaller error is not a blunder
-SHARED = 0.7  # of a stated standard deviation: the part common to a flight (base, troposphere, antenna)
+SHARED_PART = 0.7  # part of a stated standard deviation common to a flight (base, troposphere, antenna)
 
 
 @dataclass(frozen=True)
@@ -132,8 +132,8 @@ class PositionNoise:
         groups = len(positions.apart)
         typical = np.array([np.median(positions.sigmas[positions.group == g], axis=0) for g in range(groups)])
         mean = np.array([self.factors[self.of[positions.group == g]].mean(axis=0)[[0, 0, 1]] for g in range(groups)])
-        hidden = typical * np.sqrt(np.maximum(1.0 - mean**2, SHARED**2))
-        return np.where(positions.apart, unbound, np.maximum(hidden, SHARED * typical * np.maximum(mean, 1.0)))
+        hidden = typical * np.sqrt(np.maximum(1.0 - mean**2, SHARED_PART**2))
+        return np.where(positions.apart, unbound, np.maximum(hidden, SHARED_PART * typical * np.maximum(mean, 1.0)))
 
     def observations(self, positions: StatedPositions, unbound: float = 1e4) -> PositionObservations:
         """The positions as an adjustment takes them."""
@@ -197,13 +197,13 @@ class _Fit:
     cost: float
 
 
-def settled_noise(
+def noise_with_drift(
     system: CentreSystem, block: Block, positions: StatedPositions, drift: PositionNoise
 ) -> PositionNoise:
     """Estimate the factors of positions whose drift is known from others."""
     errors = block.centres[positions.photo] - positions.stated
     start = with_drift_of(as_stated(positions), drift)
-    return _settled(system, errors, positions, start)
+    return _iterate_factors(system, errors, positions, start)
 
 
 def estimate_noise(system: CentreSystem, block: Block, positions: StatedPositions) -> PositionNoise:
@@ -213,18 +213,18 @@ def estimate_noise(system: CentreSystem, block: Block, positions: StatedPosition
     noise = replace(
         noise, shares=np.full_like(noise.shares, USUAL[0]), correlations=np.full_like(noise.shares, USUAL[1])
     )
-    noise = _settled(system, errors, positions, noise)
+    noise = _iterate_factors(system, errors, positions, noise)
     if len(positions) < MIN_CLASS:
         return noise
     best = _fit(system, errors, positions, noise).cost
     for half in (1, 0):  # heights tell more
         usual = noise
         for drift in DRIFTS[1:]:
-            tried = _settled(system, errors, positions, _with_drift(usual, half, *drift), rounds=3)
+            tried = _iterate_factors(system, errors, positions, _with_drift(usual, half, *drift), rounds=3)
             cost = _fit(system, errors, positions, tried).cost
             if cost < best - (UNPROVEN if noise is usual else 0.0):
                 best, noise = cost, tried
-    return _settled(system, errors, positions, noise)
+    return _iterate_factors(system, errors, positions, noise)
 
 
 def find_blunders(
@@ -245,7 +245,7 @@ def find_blunders(
             [max(float(np.median(normed[noise.of == c])) / MEDIAN_NORM, MIN_FACTOR) for c in range(len(typical))]
         )
         after = 1.0 / (1.0 + (normed / (3.0**0.5 * CAUCHY * typical[noise.of])) ** 2)
-        if np.abs(after - weights).max() < SETTLED:
+        if np.abs(after - weights).max() < MIN_RELATIVE_CHANGE:
             break
         weights = after
     root_mean = normed / 3.0**0.5
@@ -397,7 +397,7 @@ def _fit(
     return _Fit(after, spread, likelihood + quadratic)
 
 
-def _settled(
+def _iterate_factors(
     system: CentreSystem,
     errors: Float64[np.ndarray, "k 3"],
     positions: StatedPositions,
@@ -421,7 +421,7 @@ def _settled(
         factors = _weighed(found, degrees)
         change = float(np.abs(factors / noise.factors - 1.0).max())
         noise = replace(noise, factors=factors, degrees=degrees)
-        if change < SETTLED:
+        if change < MIN_RELATIVE_CHANGE:
             break
     return noise
 

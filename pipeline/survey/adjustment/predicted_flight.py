@@ -35,13 +35,13 @@ from splatpipe.pipeline.survey.positions.photo_positions import Position
 MAX_PHOTOS = 120  # more are predicted from a part: two or three seconds
 DRAWN = 100  # points per photo, of which those that two photos show are thinned to PER_PHOTO in each
 MIN_VIEWS = 2
-RELIEF = 0.02  # of the flying height: standard deviation of the ground's heights
+RELIEF_SHARE = 0.02  # standard deviation of the ground's heights over the flying height
 FURTHEST = 4.0  # times a photo's height: what is beyond is not matched
 SEED = 41
 HEIGHT_BOUNDS_M = (2.0, 3000.0)  # above ground
-SIMILAR = (0.25, 4.0)  # of the typical height: other photos are of something else, or their altitude is wrong
-MIN_REACH = 0.1  # of the height: photos that are all nearer to each other than this see nothing in space
-NEW_GROUND = 0.07  # of a photo's footprint, shown by no other: overlaps of 75 to 80 % along, 65 to 70 % across
+SIMILAR_HEIGHTS = (0.25, 4.0)  # bounds on height over the typical one: others see something else, or are wrong
+MIN_REACH_RATIO = 0.1  # median reach of the photos over the height, below which they see nothing in space
+NEW_GROUND_SHARE = 0.07  # share of a footprint seen by no other photo: overlaps of 75-80 % along, 65-70 % across
 FILLED = 0.2  # least width over length of the flown area, to tell its density
 DOWN = math.cos(math.radians(15.0))  # views less steep show walls, which determine the focal length
 ONE_HEIGHT = 0.1  # range of the camera heights over the flying height
@@ -241,9 +241,9 @@ def _read_flight(
         return None, None
     heights = centres[:, 2] - ground
     typical = float(np.median(heights))
-    similar = np.flatnonzero((heights > SIMILAR[0] * typical) & (heights < SIMILAR[1] * typical))
+    similar = np.flatnonzero((heights > SIMILAR_HEIGHTS[0] * typical) & (heights < SIMILAR_HEIGHTS[1] * typical))
     reach = np.linalg.norm(centres[similar] - np.median(centres[similar], axis=0), axis=1)
-    if len(similar) < MIN_POSITIONS or float(np.median(reach)) < MIN_REACH * typical:
+    if len(similar) < MIN_POSITIONS or float(np.median(reach)) < MIN_REACH_RATIO * typical:
         return None, None
     guessed = _takeoff(found) is None
     return origin, _Flight(
@@ -289,9 +289,9 @@ def _ground(flight: _Flight) -> float | None:
     extent = np.linalg.svd(flight.centres[:, :2] - flight.centres[:, :2].mean(axis=0), compute_uv=False)
     if extent[0] <= 0.0 or extent[1] < FILLED * extent[0]:
         return None
-    area = 12.0 * float(extent[0] * extent[1]) / len(flight.centres)  # of a rectangle with this spread
+    area = 12.0 * float(extent[0] * extent[1]) / len(flight.centres)  # area of a rectangle with this spread
     frame = float(np.median([camera.width * camera.height / camera.focal_px**2 for camera in flight.cameras]))
-    height = math.sqrt(area / len(flight.centres) / (NEW_GROUND * frame))
+    height = math.sqrt(area / len(flight.centres) / (NEW_GROUND_SHARE * frame))
     if not HEIGHT_BOUNDS_M[0] <= height <= HEIGHT_BOUNDS_M[1]:
         return None
     return float(np.median(flight.centres[:, 2])) - height
@@ -328,8 +328,8 @@ def _part(flight: _Flight) -> Int64[np.ndarray, " k"]:
 def _synthetic_block(flight: _Flight) -> Block | None:
     """The block of a flight with tie points on the ground; None where photos do not overlap."""
     points = _draw_points(flight)
-    shown = [_pixels(flight, k, points) for k in range(len(flight.positions))]
-    seen = np.stack([np.isfinite(each[:, 0]) for each in shown], axis=1)  # (p, n)
+    projected = [_pixels(flight, k, points) for k in range(len(flight.positions))]
+    seen = np.stack([np.isfinite(each[:, 0]) for each in projected], axis=1)  # (p, n)
     chosen = np.flatnonzero(seen.sum(axis=1) >= MIN_VIEWS)
     wanted = PER_PHOTO * len(flight.positions) / max(int(seen[chosen].sum()), 1)
     chosen = chosen[np.random.default_rng(SEED).permutation(len(chosen))[: round(wanted * len(chosen))]]
@@ -337,7 +337,7 @@ def _synthetic_block(flight: _Flight) -> Block | None:
         return None
     seen = seen[chosen]
     point, photo = (each.astype(np.int64) for each in np.nonzero(seen))
-    pixels = np.stack([each[chosen] for each in shown], axis=1)[seen]
+    pixels = np.stack([each[chosen] for each in projected], axis=1)[seen]
     kinds = tuple(dict.fromkeys(flight.cameras))
     place = points[chosen]
     return Block(
@@ -367,7 +367,7 @@ def _draw_points(flight: _Flight) -> Float64[np.ndarray, "p 3"]:
         rays = rays[-rays[:, 2] * FURTHEST > np.linalg.norm(rays, axis=1)]
         found.append(centre + height * rays / -rays[:, 2:])
     points = np.concatenate(found)
-    points[:, 2] += RELIEF * float(np.median(flight.heights)) * rng.normal(size=len(points))
+    points[:, 2] += RELIEF_SHARE * float(np.median(flight.heights)) * rng.normal(size=len(points))
     return points
 
 

@@ -20,7 +20,7 @@ from splatpipe.pipeline.survey.adjustment.block_lens import Lens
 PER_PHOTO = 150  # tie points of a photo: errors within one are not independent, and more add cost, not accuracy
 PER_CELL = 2
 MIN_VIEWS = 2
-MIN_SIGMA_PX = 1.0  # of tie points: the errors of a lens and of matching are shared by neighbours
+MIN_SIGMA_PX = 1.0  # least sigma of tie points: the errors of a lens and of matching are shared by neighbours
 CELLS = 5  # a side, of the grid in which a photo's errors are averaged
 SETTLING = 6  # rounds for points that start from where their rays meet
 NEAR_PARALLEL = 1e-7  # least ratio of the eigenvalues of a point's rays

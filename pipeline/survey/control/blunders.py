@@ -36,7 +36,7 @@ EXACT_M = 0.5  # sigma of positions that also tell a pole's length and another b
 EXACT_DATUM_M = 0.3  # least offset from them that is worth a word
 POLES_M = (1.0, 3.0)  # lengths of poles
 DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
-GEOIDS_M = (-110.0, 90.0)  # of geoids above the ellipsoid
+GEOID_BOUNDS_M = (-110.0, 90.0)  # heights of geoids above the ellipsoid, lowest and highest
 SWAPPED_SHARE = 0.3  # largest share of two points' errors that remains if swapping their names explains them
 WEAK = 4.0  # model uncertainty over the control's own accuracy that is worth a warning
 MIN_GSD = 3.0  # errors below this many ground pixels are not worth a message
@@ -157,7 +157,7 @@ def tell_heights_apart(fit: JointFit, survey: Survey, stations: Stations, report
     """
     if len(stations) == 0 or not stations.absolute or all(p.surveyed.z is None for p in survey.of_role("control")):
         return
-    lift = fit.offsets[:, 2]  # of each flight's positions above the control's heights
+    lift = fit.offsets[:, 2]  # heights of each flight's positions above those of the control, metres
     above = -float(lift[np.abs(lift).argmin()])
     sigma = float(np.median(stations.sigmas[:, 2]))
     side = "above" if above > 0.0 else "below"
@@ -169,10 +169,10 @@ def tell_heights_apart(fit: JointFit, survey: Survey, stations: Stations, report
             f"Was a pole of that length not subtracted, or is the vertical datum another? {follows}",
         )
     elif max(EXACT_DATUM_M if sigma <= EXACT_M else DATUM_M, DATUM_SIGMAS * sigma) < abs(above) <= DATUMS_APART_M:
-        possible = GEOIDS_M[0] <= -above <= GEOIDS_M[1]
+        possible = GEOID_BOUNDS_M[0] <= -above <= GEOID_BOUNDS_M[1]
         report.note(
             f"{where}: possibly one is above the geoid and the other above the ellipsoid,"
-            f" which lie {GEOIDS_M[0]:g} to {GEOIDS_M[1]:+g} m apart. {follows}"
+            f" which lie {GEOID_BOUNDS_M[0]:g} to {GEOID_BOUNDS_M[1]:+g} m apart. {follows}"
             if possible
             else f"{where}: their vertical datums differ. {follows}"
         )

@@ -73,7 +73,7 @@ SUSPICIOUS = 1.0  # noise over sigmas; sound control with realistic sigmas stays
 SINGLE_BLUNDER_GAIN = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
 MANY_OFF_SIGMAS = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
 SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
-ROUNDS = 4  # of adjustment, each without a blunder found in the one before, or with larger sigmas
+MAX_ROUNDS = 4  # adjustments, each without a blunder found in the one before, or with larger sigmas
 
 
 @dataclass(frozen=True)
@@ -191,10 +191,10 @@ class _TrustedAdjustment:
     noise: float
 
 
-def _settle(case: _Case, report: Reporter) -> _TrustedAdjustment:
+def _adjust_until_consistent(case: _Case, report: Reporter) -> _TrustedAdjustment:
     """Adjust until the control agrees, leaving out single blunders or else enlarging the sigmas."""
     best = _try(case.result.survey, 1.0, case)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         better = _without_one(best, case) if best.noise > SUSPICIOUS else None
         if better is None:
             if best.noise <= QUIET:
@@ -221,21 +221,21 @@ def _try(survey: Survey, factor: float, case: _Case) -> _TrustedAdjustment:
     return _TrustedAdjustment(survey, done, ends, factor, _noise(done.normed, coordinates))
 
 
-def _without_one(settled: _TrustedAdjustment, case: _Case) -> tuple[int, float, _TrustedAdjustment] | None:
+def _without_one(trusted: _TrustedAdjustment, case: _Case) -> tuple[int, float, _TrustedAdjustment] | None:
     """Return the point without which the others agree, its offset in metres, and that adjustment; None if there is
     none."""
     result, capture = case.result, case.capture
-    chosen = _chosen(settled.survey)
-    if len(chosen) <= MIN_CONTROL or float(np.median(settled.done.normed)) > MANY_OFF_SIGMAS:
+    chosen = _chosen(trusted.survey)
+    if len(chosen) <= MIN_CONTROL or float(np.median(trusted.done.normed)) > MANY_OFF_SIGMAS:
         return None
-    for worst in np.argsort(-settled.done.normed, kind="stable")[:SUSPECTS].tolist():
+    for worst in np.argsort(-trusted.done.normed, kind="stable")[:SUSPECTS].tolist():
         index = chosen[worst]
-        points = list(settled.survey.points)
+        points = list(trusted.survey.points)
         points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
-        rest = _try(settled.survey.with_points(points), settled.factor, case)
-        if rest.noise <= settled.noise / SINGLE_BLUNDER_GAIN:
+        rest = _try(trusted.survey.with_points(points), trusted.factor, case)
+        if rest.noise <= trusted.noise / SINGLE_BLUNDER_GAIN:
             model = model_of(rest.done.reconstruction, capture.photos)
-            found = locate(settled.survey.points[index], model, capture.photos, case.config.mark_sigma_px).found
+            found = locate(trusted.survey.points[index], model, capture.photos, case.config.mark_sigma_px).found
             if found is not None:
                 known = np.isfinite(result.site.targets.sigmas[index])
                 place = result.placed.world_from_model.apply(found.xyz[None])[0]
@@ -249,11 +249,11 @@ def _adjusted(
 ) -> ControlResult:
     """Return the result with the adjusted model, if the adjustment moves the images' content noticeably."""
     try:
-        settled = _settle(_Case(result, capture, config, _start(result, capture), bars), report)
+        trusted = _adjust_until_consistent(_Case(result, capture, config, _start(result, capture), bars), report)
     except np.linalg.LinAlgError as error:
         report.warning(f"Control places the model, but cannot adjust it: {error}.", "Is the sparse model sound?")
         return result
-    survey, done, factor = settled.survey, settled.done, settled.factor
+    survey, done, factor = trusted.survey, trusted.done, trusted.factor
     if not done.usable:
         report.warning(
             "The adjustment to the control did not converge: the control georeferences the model without adjusting it.",
@@ -291,7 +291,7 @@ def _adjusted(
     ]
     placed = GeoreferencedModel(model, world_from_model, done.offsets)
     every = world_from_model.inverse().apply(np.concatenate([done.places, done.bar_ends]))
-    ends = {name: every[index] for name, index in settled.ends.items()}
+    ends = {name: every[index] for name, index in trusted.ends.items()}
     return replace(result, survey=survey.with_points(points), placed=placed, adjusted=adjusted, bar_ends=ends)
 
 

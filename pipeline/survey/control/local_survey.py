@@ -25,12 +25,12 @@ from splatpipe.pipeline.survey.placing.model import SparseModel
 from splatpipe.pipeline.survey.points.surveyed_points import Survey
 
 MIN_CONTROL = 3  # without positions
-START_SHARE = 0.05  # of the control's extent: the largest miss of an inlier to a hypothesis
-OFFSET_SIGMA_M = 2.0  # of a flight's positions at least: a base station's coordinates
+INLIER_SHARE = 0.05  # largest miss of an inlier to a hypothesis, over the control's extent
+OFFSET_SIGMA_M = 2.0  # least sigma of a flight's common offset: a base station's coordinates
 OFFSET_SIGMAS = 3.0  # times the positions' sigmas
-DATUM_SIGMA_M = 1000.0  # of heights: those of control and of receivers need not share a datum
-MIN_EXTENT_M = 0.01  # of control points, to count as several
-MISFIT_SHARE = 0.25  # of the control's extent: a fit that is off by more is rejected
+DATUM_SIGMA_M = 1000.0  # sigma of a flight's offset in height: control and receivers need not share a datum
+MIN_EXTENT_M = 0.01  # extent of control points below which they count as one
+MAX_MISFIT_SHARE = 0.25  # error of a fit over the control's extent, above which it is rejected
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ def start_similarity(
         extent = float(np.linalg.norm(np.ptp(target[known], axis=0)))
         points = Correspondences(source[known], target[known], sigmas[known])
         try:
-            found = robust_similarity(points, max(1.0, START_SHARE * extent), prior)
+            found = robust_similarity(points, max(1.0, INLIER_SHARE * extent), prior)
         except ValueError as error:
             raise FrameUndeterminedError(f"the control points do not determine the frame ({error})") from error
         return found.similarity, Priors(offsets, prior if found.used_prior else None)
@@ -270,7 +270,7 @@ def require_fit(fit: JointFit, observed: JointObservations, survey: Survey) -> N
             f"All control points of {survey.name} have the same coordinates.",
             "Each name needs its own coordinates: was one line copied to all?",
         )
-    if error > MISFIT_SHARE * extent:
+    if error > MAX_MISFIT_SHARE * extent:
         raise SplatpipeError(
             f"The control points of {survey.name} do not fit the model: they are {error:,.1f} m off"
             f" over an extent of {extent:,.1f} m.",

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.survey.control.confidence import rmse_interval
 
-DIGITS = 6  # of lengths in metres
+DIGITS = 6  # decimals of lengths in metres
 
 
 def accuracy_table(residuals: Float64[np.ndarray, "n 3"]) -> dict[str, Any] | None:

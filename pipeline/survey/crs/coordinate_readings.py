@@ -13,15 +13,15 @@ from jaxtyping import Bool, Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs, utm_of
 from splatpipe.pipeline.survey.crs.geodesy import ecef_from_geodetic
-from splatpipe.pipeline.survey.crs.readings import MIN_WITNESSES, TIMES_LESS, Evidence, Reading, plausible
+from splatpipe.pipeline.survey.crs.readings import MAX_STATED_RATIO, MIN_WITNESSES, Evidence, Reading, plausible
 
 FAR_M = 2000.0  # from the photos; control that they show must be nearer
 ZONE = 1e6  # what a zone number in front of an easting counts
 FOOT_M = 0.3048  # the US survey foot differs by 2e-6, which no position this far off can tell
 CUT = 1e5  # leading digits from here on are sometimes dropped for brevity
-SHAPE_SHARE = 0.05  # of the points' extent: how far a point may be off the shape of the others
-SAME_SCALE = 1.2  # of the model by its positions and by a reading
-SAME_HEADING = np.radians(20.0)  # likewise
+MAX_MISFIT_SHARE = 0.05  # how far a point may be off the shape of the others, over the points' extent
+MAX_SCALE_RATIO = 1.2  # factor between the model's scales by its positions and by a reading, at most
+MAX_TURN_RAD = np.radians(20.0)  # angle between the model's headings by both, at most
 Plane = Float64[np.ndarray, "n 2"]
 
 
@@ -45,7 +45,7 @@ def nearer_reading(stated: Plane, crs: Crs, positions: Float64[np.ndarray, "m 3"
     if len(stated) == 0:
         return ""
     as_stated = _evidence(stated, crs, positions)
-    if as_stated.share >= TIMES_LESS:  # no reading explains more than all
+    if as_stated.share >= MAX_STATED_RATIO:  # no reading explains more than all
         return ""
     texts, place = [crs.text], None
     if len(positions):
@@ -164,14 +164,14 @@ def shape_reading(found: Places, surveyed: Places, heights: Bool[np.ndarray, " n
 def _alike(found: Places, surveyed: Places, heights: Bool[np.ndarray, " n"]) -> Evidence:
     """How many points a turn about the vertical, a shift and a slight change of scale bring to their places."""
     extent = float(np.linalg.norm(np.ptp(surveyed[:, :2], axis=0)))
-    tolerance = SHAPE_SHARE * extent
+    tolerance = MAX_MISFIT_SHARE * extent
     a, b = found[:, 0] + 1j * found[:, 1], surveyed[:, 0] + 1j * surveyed[:, 1]
     best = 0
     for i, j in itertools.islice(itertools.combinations(range(len(a)), 2), 500):
         if abs(a[j] - a[i]) < tolerance:
             continue
         turn = (b[j] - b[i]) / (a[j] - a[i])
-        if not 1.0 / SAME_SCALE <= abs(turn) <= SAME_SCALE or abs(np.angle(turn)) > SAME_HEADING:
+        if not 1.0 / MAX_SCALE_RATIO <= abs(turn) <= MAX_SCALE_RATIO or abs(np.angle(turn)) > MAX_TURN_RAD:
             continue
         near = np.abs(b[i] + turn * (a - a[i]) - b) <= tolerance
         lift = surveyed[:, 2] - abs(turn) * found[:, 2]

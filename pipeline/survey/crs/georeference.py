@@ -13,7 +13,7 @@ from splatpipe.pipeline.survey.crs.frames import Frame
 from splatpipe.pipeline.survey.crs.world import World, open_world
 
 FORMAT = 1
-PERCENTILES = (1.0, 99.0)  # of the sparse points: the rest may lie kilometres away
+EXTENT_PERCENTILES = (1.0, 99.0)  # percentiles that bound the sparse points: the rest may lie kilometres away
 
 
 def scene_box(points: Float64[np.ndarray, "n 3"], centres: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "2 3"]:
@@ -27,7 +27,7 @@ def scene_box(points: Float64[np.ndarray, "n 3"], centres: Float64[np.ndarray, "
         Least and largest coordinates.
     """
     usable = points[np.isfinite(points).all(axis=1)]
-    corners = [centres, np.percentile(usable, PERCENTILES, axis=0)] if len(usable) else [centres]
+    corners = [centres, np.percentile(usable, EXTENT_PERCENTILES, axis=0)] if len(usable) else [centres]
     every = np.concatenate([*corners, np.zeros((0 if len(centres) or len(usable) else 1, 3))])
     return np.stack([every.min(axis=0), every.max(axis=0)])
 

@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.crs.world import World
 
 DEGREE = 3
 STEPS = 7  # samples along each side, more than there are powers
-MIN_REACH_M = 500.0  # of the box that the polynomial is fitted over: people also point at what is around the scene
+MIN_REACH_M = 500.0  # least half side of the polynomial's box: people also point at what is around the scene
 REACH_PER_SCENE = 2.0
 
 

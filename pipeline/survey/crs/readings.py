@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 MIN_WITNESSES = 6  # marks or positions that name a cause; fewer agree by chance
 MIN_CONTRADICTING = 3  # that stop a file without naming one; fewer are single mistakes, and told one by one
-EXPLAINED = 0.8  # share that a reading must explain to be named
-TIMES_LESS = 0.5  # of that: the share that the file as it stands may explain at most
+MIN_EXPLAINED_SHARE = 0.8  # share that a reading must explain to be named
+MAX_STATED_RATIO = 0.5  # share that the file as it stands may explain, over the reading's share
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,11 @@ def plausible(
     """
     best: tuple[Reading, Evidence] | None = None
     for reading, evidence in others:
-        sound = evidence.of >= least and evidence.share >= EXPLAINED and stated.share < TIMES_LESS * evidence.share
+        sound = (
+            evidence.of >= least
+            and evidence.share >= MIN_EXPLAINED_SHARE
+            and stated.share < MAX_STATED_RATIO * evidence.share
+        )
         if sound and (best is None or evidence.share > best[1].share):
             best = reading, evidence
     return best

@@ -34,7 +34,7 @@ from splatpipe.pipeline.survey.crs.crs import (
 from splatpipe.pipeline.survey.crs.frames import Frame
 from splatpipe.pipeline.survey.crs.geodesy import Origin, ecef_from_geodetic
 
-STEP_M = 100.0  # of the central differences: their third-order error is 1e-12 of a length, float64's is 1e-11
+STEP_M = 100.0  # step of the central differences: their third-order error is 1e-12 of a length, float64's is 1e-11
 BOX_STEPS = 9  # samples along each side of the scene: errors are quadratic, so largest at its edges
 AUTO = "auto"
 

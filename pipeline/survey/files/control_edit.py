@@ -166,16 +166,16 @@ class ControlText:
 
     def _marked(self, line: str, photo: str, pixel: tuple[float, float] | None, keep: bool) -> str:
         """Return an observation's line with a new pixel and, unless ``keep``, a new photo name."""
-        shown = ("", "") if pixel is None else (f"{pixel[0]:.2f}", f"{pixel[1]:.2f}")
+        pixel_fields = ("", "") if pixel is None else (f"{pixel[0]:.2f}", f"{pixel[1]:.2f}")
         if self.table.header is None:
             fields = fields_of(line, self.table.separator)
-            fields[3:5] = shown
+            fields[3:5] = pixel_fields
             fields[5] = fields[5] if keep else photo
             return _joined(fields, self.table.separator, tabs=line.count("\t") >= TABS)
         delimiter, columns = self._columns()
         cells = cells_of(line, delimiter)
         cells += [""] * (max(columns.values()) + 1 - len(cells))
-        cells[columns["px"]], cells[columns["py"]] = shown
+        cells[columns["px"]], cells[columns["py"]] = pixel_fields
         cells[columns["photo"]] = cells[columns["photo"]] if keep else photo
         return _csv_line(cells, delimiter)
 

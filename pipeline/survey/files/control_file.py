@@ -19,8 +19,8 @@ from splatpipe.pipeline.survey.files.survey_text import (
     ELLIPSOIDAL_Z,
     GEOGRAPHIC,
     GEOGRAPHIC_Y,
-    LOOKED_AT,
     MAX_LINE_CHARS,
+    SAMPLE_LINES,
     SEPARATORS,
     UNKNOWN,
     LineError,
@@ -90,7 +90,7 @@ ROLES: Mapping[str, Role] = {
     "cp": "check",
     "check point": "check",
     "control point": "control",
-    "3d gcp": "control",  # of Pix4D
+    "3d gcp": "control",  # as Pix4D calls it
 }
 
 
@@ -280,8 +280,8 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row], str]:
     for number, line in written[1:]:
         fields = fields_of(line, separator)
         if len(fields) < 6:
-            counted = f"{len(fields)} field{'' if len(fields) == 1 else 's'} separated by {SEPARATORS[separator]}"
-            raise LineError(number, f"{counted}, but at least 6 are needed: x y z pixel_x pixel_y photo")
+            field_count = f"{len(fields)} field{'' if len(fields) == 1 else 's'} separated by {SEPARATORS[separator]}"
+            raise LineError(number, f"{field_count}, but at least 6 are needed: x y z pixel_x pixel_y photo")
         place = (number_in(number, "x", fields[0]), number_in(number, "y", fields[1]), _height(number, fields[2]))
         mark = Mark(
             _name(number, fields[5]), number_in(number, "pixel x", fields[3]), number_in(number, "pixel y", fields[4])
@@ -304,7 +304,7 @@ def _require_no_points(written: Sequence[tuple[int, str]]) -> None:
         LineError: if the lines are such points.
     """
     for separator in filter(None, SEPARATORS):
-        looked = [list_fields(line, separator, TABS) for _, line in written[:LOOKED_AT]]
+        looked = [list_fields(line, separator, TABS) for _, line in written[:SAMPLE_LINES]]
         points = [each for each in looked if len(each) >= 4 and all(map(is_numeral, each[1:4]))]
         if points and 2 * len(points) >= len(looked) and not any(is_photo(PurePosixPath(cell)) for cell in points[0]):
             what = f"points separated by {SEPARATORS[separator]} without titles"

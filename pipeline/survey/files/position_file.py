@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.files.survey_text import (
     ELLIPSOIDAL_Z,
     GEOGRAPHIC,
     GEOGRAPHIC_Y,
-    MOST_WORDS,
+    MAX_NAME_WORDS,
     SEPARATORS,
     UNKNOWN,
     LineError,
@@ -157,7 +157,7 @@ def _odm_rows(
     for number, line in written[1:]:
         fields = _fields(line, separator, find)
         if len(fields) < 3:
-            raise LineError(number, f"{_counted(len(fields), separator)}, but at least 3 are needed: photo x y")
+            raise LineError(number, f"{_field_count(len(fields), separator)}, but at least 3 are needed: photo x y")
         row = dict(zip(ODM_ORDER, fields, strict=False))
         if len(fields) < ANGLES_FROM:
             row = {key: row[key] for key in ("name", "x", "y", "z") if key in row}
@@ -173,7 +173,7 @@ def _fields(line: str, separator: str, find: NameFinder | None) -> list[str]:
     whole = with_whole_name(fields, 0)
     if len(whole) < len(fields) or is_photo(PurePosixPath(fields[0])):
         return whole
-    for end in range(min(len(fields) - 2, MOST_WORDS)):  # a name without a suffix
+    for end in range(min(len(fields) - 2, MAX_NAME_WORDS)):  # a name without a suffix
         name = " ".join(fields[: end + 1])
         is_place = all(map(is_numeral, fields[end + 1 : end + 3]))
         if is_place and (find is None or find(name) is not None):
@@ -181,7 +181,7 @@ def _fields(line: str, separator: str, find: NameFinder | None) -> list[str]:
     return fields
 
 
-def _counted(count: int, separator: str) -> str:
+def _field_count(count: int, separator: str) -> str:
     return f"{count} field{'' if count == 1 else 's'} separated by {SEPARATORS[separator]}"
 
 

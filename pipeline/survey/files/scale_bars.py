@@ -30,7 +30,7 @@ MAX_BARS = 1000
 MAX_NAME = 255
 LENGTH_BOUNDS_M = (1e-3, 1e5)
 SIGMA_BOUNDS_M = (1e-6, 1e3)
-STATED_SIGMA_M = 0.001  # of a bar whose file states none: a folding rule's
+DEFAULT_SIGMA_M = 0.001  # sigma of a bar whose file states none: a folding rule's
 WORST_AGREEMENT = 0.05  # relative deviation from the bars' median above which a bar is left out
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "a": ("name_a", "a", "from", "target_a", "marker_a", "start"),
@@ -118,7 +118,7 @@ def _bar(number: int, cells: Sequence[str], places: Mapping[str, int]) -> ScaleB
     length = number_in(number, "the distance", row["metres"])
     if not LENGTH_BOUNDS_M[0] <= length <= LENGTH_BOUNDS_M[1]:
         raise LineError(number, f"a distance of {length:g} m")
-    sigma = STATED_SIGMA_M
+    sigma = DEFAULT_SIGMA_M
     if row.get("sigma", "").casefold() not in UNKNOWN:
         sigma = number_in(number, "the standard deviation", row["sigma"])
         if not SIGMA_BOUNDS_M[0] <= sigma <= SIGMA_BOUNDS_M[1]:

@@ -18,7 +18,7 @@ from splatpipe.pipeline.engine.files.text_lines import text_lines
 from splatpipe.pipeline.photos.files.names import is_photo
 
 MAX_LINE_CHARS = 2000
-LARGEST = 1e9  # of a coordinate, metres or pixels: larger ones are neither on the earth nor in a photo
+MAX_COORDINATE = 1e9  # magnitude of a coordinate, metres or pixels: larger ones are neither on the earth nor in a photo
 UNKNOWN = ("", "-", "nan", "none", "null", "n/a")
 CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg|coordinate[ _]?system)\s*[:=]\s*(\S.*)", re.IGNORECASE)
 # EPSG:1, EPSG::1, AUTHORITY["EPSG","1"]
@@ -29,8 +29,8 @@ GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "gps_longitude"
 GEOGRAPHIC_Y = ("lat", "latitude", "gpslatitude", "gps_latitude", "y/latitude", "latitude_deg")
 ELLIPSOIDAL_Z = ("ellipsoidal_height", "ellipsoid_height")
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "": "blanks"}
-MOST_WORDS = 20  # of a photo's name in a list whose fields blanks separate
-LOOKED_AT = 20  # lines of a list without a header, by which its separator is found
+MAX_NAME_WORDS = 20  # words of a photo's name in a list whose fields blanks separate
+SAMPLE_LINES = 20  # lines of a list without a header, by which its separator is found
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 CODE = re.compile(r"EPSG\s*:|\+|WGS\s?84\s*/?\s*UTM", re.IGNORECASE)  # how a CRS begins that splatpipe knows by itself
 CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
@@ -165,7 +165,7 @@ def list_separator(rows: Sequence[tuple[int, str]], numbers: Sequence[int]) -> s
         rows: Its lines.
         numbers: The fields that are numbers in most lines, if the separator is the right one.
     """
-    looked = [line for _, line in rows[:LOOKED_AT]]
+    looked = [line for _, line in rows[:SAMPLE_LINES]]
 
     def fits(line: str, separator: str) -> bool:
         fields = line.split(separator)
@@ -192,7 +192,7 @@ def list_fields(line: str, separator: str, tabs: int) -> list[str]:
 
 def with_whole_name(fields: Sequence[str], at: int) -> list[str]:
     """Fields that blanks separate, with those of a photo's name joined: up to the first that ends in its suffix."""
-    ends = (end for end in range(at, min(len(fields), at + MOST_WORDS)) if is_photo(PurePosixPath(fields[end])))
+    ends = (end for end in range(at, min(len(fields), at + MAX_NAME_WORDS)) if is_photo(PurePosixPath(fields[end])))
     end = next(ends, at)
     return [*fields[:at], " ".join(fields[at : end + 1]), *fields[end + 1 :]] if at < len(fields) else list(fields)
 
@@ -233,7 +233,7 @@ def number_in(line: int, what: str, text: str) -> float:
         LineError: if it is not such a number.
     """
     text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
-    if not is_number(text) or abs(float(text)) > LARGEST:
+    if not is_number(text) or abs(float(text)) > MAX_COORDINATE:
         raise LineError(line, f"{what} is {text[:40]!r}, which is not a valid number")
     return float(text)
 

@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.placing.model import SparseModel
 from splatpipe.pipeline.survey.placing.position_spread import spread_of
 
 ASSUMED = "assumed"  # an altitude's source
-LONG_PAIRS = 0.5  # of the pairs of cameras: the scale is from the longer ones, which errors change less
+LONG_PAIR_QUANTILE = 0.5  # share of the pairs of cameras, the longest, that give the scale: errors change it less
 MAX_PAIRED = 500  # cameras
 MIN_SIGMA_M = 1.0
 
@@ -65,6 +65,6 @@ def _horizontal_scale(cameras: Float64[np.ndarray, "n 2"], records: Sequence[Map
     first, second = np.triu_indices(len(stated), 1)
     ours = np.linalg.norm(cameras[::step][first] - cameras[::step][second], axis=1)
     theirs = np.linalg.norm(stated[first] - stated[second], axis=1)
-    long = ours >= np.quantile(ours, LONG_PAIRS)
+    long = ours >= np.quantile(ours, LONG_PAIR_QUANTILE)
     scale = float(np.median(theirs[long] / np.maximum(ours[long], 1e-300)))
     return scale if 0.0 < scale < math.inf and ours.any() else None

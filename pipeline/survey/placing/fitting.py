@@ -22,14 +22,14 @@ from splatpipe.pipeline.survey.placing.uncertainty import Uncertainty, uncertain
 
 MIN_POSITIONS = 3
 MAX_SIGMA_SCALE = 0.2  # a less certain scale is unusable
-MAX_SIGMA_ROTATION_RAD = math.radians(15.0)  # likewise for a direction
+MAX_SIGMA_ROTATION_RAD = math.radians(15.0)  # a direction known no better is unusable
 DOUBTFUL_UP_RAD = math.radians(2.5)  # where errors drift, an up direction less certain than this may be wrong
 CONTRADICTION = 2.0  # joint sigmas between the positions' directions and those of the cameras
 SLOW = 0.5  # correlation above which the stated accuracy depends on how errors drift
 OUTLIER_NOISES = 6.0  # times the noise of all positions
 OUTLIER_SIGMAS = 3.0  # times the stated sigma: a smaller error is not an outlier
 ROUNDS = 4
-MAX_LOG_SCALE_CHANGE = math.log(1.5)  # of the scale from the robust fit's, which noise of half of that cannot make
+MAX_LOG_SCALE_CHANGE = math.log(1.5)  # from the robust fit: noise of half of that cannot change it by more
 
 
 class FrameUndeterminedError(Exception):

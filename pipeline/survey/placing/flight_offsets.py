@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.alignment import Correspondences, SharedErrors, SimilarityFit, offset_step_sigmas
 from splatpipe.pipeline.survey.crs.crs_names import UNKNOWN
 
-MIN_PHOTOS = 3  # of a flight with its own offset; fewer do not determine it
+MIN_PHOTOS = 3  # photos of a flight with its own offset; fewer do not determine it
 MAX_FLIGHTS = 100  # with offsets of their own: the largest
 APART_SIGMAS = 3.0  # a larger difference is not receiver error, but another datum or another base
 UNBOUND_M = 1e4  # a standard deviation that imposes no constraint

@@ -44,11 +44,11 @@ from splatpipe.pipeline.survey.placing.position_spread import spread_of
 from splatpipe.pipeline.survey.placing.up_witnesses import UpVerdict, check_up
 
 ORIGIN_DIGITS = 5  # degrees: about a metre, so that the origin stays put when a few photos are added or removed
-SWAPPED_NOISE = 0.5  # of the residuals: if swapped coordinates fit twice as well, they are swapped
+SWAPPED_NOISE_RATIO = 0.5  # noise with swapped coordinates over that as stated, below which they are swapped
 POOR_NOISES = 2.0  # times the stated sigmas: worth a warning
 LINE_RAD = math.radians(60.0)  # if the rotation about an axis is no better determined, positions lie along that axis
 NADIR_PITCH_DEG = -60.0
-HEIGHT_TOLERANCE = 0.1  # of the height above ground, against what the drone measured
+MAX_HEIGHT_DEVIATION = 0.1  # relative difference from the drone's height above ground that is worth a warning
 
 
 def georeference(
@@ -153,7 +153,7 @@ def _require_unswapped(
     except (ValueError, FrameUndeterminedError):
         return
     determined = fit.sigma_scale <= MAX_SIGMA_SCALE and fit.sigma_rotation_rad <= MAX_SIGMA_ROTATION_RAD
-    if determined and fit.noise < SWAPPED_NOISE * noise:
+    if determined and fit.noise < SWAPPED_NOISE_RATIO * noise:
         raise FrameUndeterminedError("the photo positions fit only with latitude and longitude swapped: correct them")
 
 
@@ -234,7 +234,7 @@ def report_frame(frame: Frame, model: SparseModel, positions: Positions, report:
             "The photos themselves are used.",
         )
     heights = _heights(frame, model, positions)
-    if heights is not None and abs(heights[0] / heights[1] - 1.0) > HEIGHT_TOLERANCE:
+    if heights is not None and abs(heights[0] / heights[1] - 1.0) > MAX_HEIGHT_DEVIATION:
         report.warning(
             f"The cameras are {heights[0]:.1f} m above the ground in the model, {heights[1]:.1f} m according to "
             "the drone.",

@@ -26,7 +26,7 @@ from splatpipe.pipeline.survey.placing.fitting import Directions
 from splatpipe.pipeline.survey.placing.model import SparseModel
 
 MIN_ANGLES = 3
-GIMBAL_SIGMA_RAD = math.radians(3.0 * math.sqrt(2.0))  # of each of three axes: 3° of the rotation about any
+GIMBAL_SIGMA_RAD = math.radians(3.0 * math.sqrt(2.0))  # sigma of each axis; 3° for the rotation about any
 GIMBAL_SPREAD_RAD = math.radians(15.0)  # angles that deviate more from the model are in another convention
 UP_SIGMA_RAD = math.radians(5.0)
 

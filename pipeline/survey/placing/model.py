@@ -45,11 +45,11 @@ class ModelView:
         """Derivative of the photo's pixels by a ray's x/z and y/z; not finite where the lens model is undefined."""
         around = np.tile(np.append(ray, 1.0), (4, 1))
         around[:, :2] += RAY_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-        shown = self.camera.img_from_cam(around) if np.isfinite(ray).all() else None
-        if shown is None:
+        projected = self.camera.img_from_cam(around) if np.isfinite(ray).all() else None
+        if projected is None:
             return np.full((2, 2), np.nan)
-        shown = np.asarray(shown, np.float64).reshape(4, 2)
-        return np.asarray((shown[::2] - shown[1::2]).T / (2.0 * RAY_STEP * self.scale))
+        projected = np.asarray(projected, np.float64).reshape(4, 2)
+        return np.asarray((projected[::2] - projected[1::2]).T / (2.0 * RAY_STEP * self.scale))
 
     def pixel(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 2"]:
         """Project a point of the model into the photo, in pixels; not finite behind the camera."""

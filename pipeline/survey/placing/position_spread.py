@@ -14,7 +14,7 @@ from splatpipe.pipeline.survey.placing.fitting import MAX_SIGMA_SCALE, MIN_POSIT
 from splatpipe.pipeline.survey.positions.position_sources import same_place
 
 LINE_SIGMAS = 1.0  # root mean square distance from a line, over the stated accuracy
-LINE_WIDTH = 0.1  # the same over that along the line: a small loop is no line, however inaccurate
+LINE_WIDTH = 0.1  # width of a line over its length, both root mean squares: a small loop is no line, however inaccurate
 NUMBERS = {1: "one", 2: "two"}
 
 

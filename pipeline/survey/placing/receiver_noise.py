@@ -28,12 +28,12 @@ from splatpipe.pipeline.geometry.similarity import (
 CORRELATIONS = np.array([*np.arange(0.0, 0.9, 0.05), 0.9, 0.925, 0.95, 0.97, 0.98, 0.99])
 UNPROVEN = 2.0  # least gain in minus twice the log-likelihood for a correlation to be accepted (Akaike 1974)
 GROUP_OF_AXIS = np.array([0, 0, 1])  # east, north; up
-PLACE = np.arange(4, SIMILARITY)  # of the unknowns
-ROUNDS = 40
-SETTLED = 1e-9  # of a step, in radians and relative to the extent
+TRANSLATION = np.arange(4, SIMILARITY)  # translation among the unknowns of the similarity
+MAX_ROUNDS = 40
+STEP_TOLERANCE = 1e-9  # size of a step at which iterations end: radians, and relative to the extent
 SEARCHED_ROUNDS = 3  # in which every correlation is tried; later ones try only the neighbours of the best
 FACTOR_ROUNDS = 2  # each; the rounds of the fit do the rest
-MIN_FACTOR = 1e-6  # of the stated sigmas: exact positions have no noise to estimate
+MIN_FACTOR = 1e-6  # least noise over the stated sigmas: exact positions have no noise to estimate
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 
 
@@ -98,7 +98,7 @@ def fit_with_noise(
     similarity = start
     offsets = np.zeros((0 if points.shared is None else len(points.shared.sigmas), 3))
     noise = ReceiverNoise(np.ones(2), np.zeros(2), np.full(2, float(len(points))))
-    for done in range(ROUNDS):
+    for done in range(MAX_ROUNDS):
         rows = _rows(points, before, similarity, offsets)
         extra, pull = _held(points, similarity, prior), _pull(points, similarity, offsets, prior)
         noise = _reml(rows, extra, noise, _tried(noise, len(points) if correlated else 0, done))
@@ -110,16 +110,16 @@ def fit_with_noise(
         weighted = whitened * np.sqrt(_cauchy(whitened))[:, None]
         normal = weighted.T @ weighted
         step = np.zeros(len(pull))
-        turning = np.delete(np.arange(len(pull)), PLACE)
+        turning = np.delete(np.arange(len(pull)), TRANSLATION)
         step[turning] = -solve_step(
             (normal[:-1, :-1] + extra)[np.ix_(turning, turning)], (normal[:-1, -1] + pull)[turning]
         )
         similarity = moved_similarity(similarity, points.source, step[:SIMILARITY])
         offsets = offsets + step[SIMILARITY:].reshape(-1, 3)
-        step[PLACE] = -_mean_residual(points, similarity, offsets)
-        similarity = replace(similarity, translation=similarity.translation + step[PLACE])
+        step[TRANSLATION] = -_mean_residual(points, similarity, offsets)
+        similarity = replace(similarity, translation=similarity.translation + step[TRANSLATION])
         extent = float(np.ptp(points.target, axis=0).max())
-        if np.abs(step[:4]).max() < SETTLED and np.abs(step[4:]).max() < SETTLED * extent:
+        if np.abs(step[:4]).max() < STEP_TOLERANCE and np.abs(step[4:]).max() < STEP_TOLERANCE * extent:
             break
     return _with_covariance(points, before, similarity, offsets, noise, prior)
 
@@ -161,9 +161,9 @@ def _with_covariance(
     whitened = _whitened(_rows(points, before, similarity, offsets), cautious)[:, :-1]
     information = whitened.T @ whitened + _held(points, similarity, prior)
     covariance = _inverse(information)[:SIMILARITY, :SIMILARITY]
-    known = np.diag(covariance)[PLACE]
+    known = np.diag(covariance)[TRANSLATION]
     own = _variance_of_mean(points, before, cautious)
-    covariance[PLACE, PLACE] = np.maximum(known, own)
+    covariance[TRANSLATION, TRANSLATION] = np.maximum(known, own)
     centre = similarity.apply(points.source.mean(axis=0)[None])[0]
     return NoisyFit(similarity, noise, covariance, centre, offsets)
 

@@ -13,8 +13,8 @@ from splatpipe.pipeline.geometry.similarity import similarity_jacobian
 from splatpipe.pipeline.survey.placing.receiver_noise import NoisyFit, ReceiverNoise
 
 NORMAL_95 = 1.959964
-MIN_DEGREES = 3.0  # of freedom that intervals count on: of strongly correlated errors, effective ones run out
-MAX_PLACES = 2000  # of the model where the accuracy of its coordinates is evaluated
+MIN_DEGREES = 3.0  # least degrees of freedom for intervals: with strong correlations, effective ones run out
+MAX_PLACES = 2000  # places in the model where the accuracy of its coordinates is evaluated
 DIGITS = 6
 
 
@@ -104,8 +104,10 @@ def uncertainty_of(
             which already account for it.
     """
     spread = 2.0 * np.sqrt(2.0 / np.maximum(fit.noise.degrees, 1.0))
-    shown = fit.noise.factors**2 * (1.0 + spread)  # its upper bound: no common error is left if the noise is as stated
-    common = stated * np.sqrt(np.maximum(1.0 - shown, 0.0))
+    variance_bound = fit.noise.factors**2 * (
+        1.0 + spread
+    )  # its upper bound: no common error is left if the noise is as stated
+    common = stated * np.sqrt(np.maximum(1.0 - variance_bound, 0.0))
     common_3 = common[[0, 0, 1]]
     covariance = fit.covariance
     tilt = covariance[:2, :2]

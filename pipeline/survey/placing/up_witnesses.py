@@ -30,11 +30,11 @@ from splatpipe.pipeline.survey.positions.flight_steps import (
 )
 
 MIN_PHOTOS = 3
-SHARE = 0.8  # of the photos that must agree for a statement
+MIN_SHARE = 0.8  # share of the photos that must agree for a statement
 LEVEL_SINE = np.sin(np.radians(15.0))  # views and edges that are closer to level than this say nothing
 FLYING_M = 5.0  # above take-off: the ground is below, whatever is being photographed
-ABOVE_SHARE = 0.95  # of the points above flying cameras: no ground is among them
-VERTICAL = 0.9  # of the mean view, whose length is less where views differ
+ABOVE_SHARE = 0.95  # share of points above flying cameras that shows a model upside down: no ground is among them
+MIN_VERTICAL_PART = 0.9  # vertical part of the mean view for photos from above; less where the views differ
 FLYING = "the direction of flight against the headings"
 STOPPING = 2  # witnesses against a placement
 
@@ -133,7 +133,7 @@ def _by_photos(what: str, against: Bool[np.ndarray, " k"], *, of_gimbal: bool = 
     if len(against) < MIN_PHOTOS:
         return None
     share = float(against.mean())
-    return Witness(what, share >= SHARE, of_gimbal) if share >= SHARE or share <= 1.0 - SHARE else None
+    return Witness(what, share >= MIN_SHARE, of_gimbal) if share >= MIN_SHARE or share <= 1.0 - MIN_SHARE else None
 
 
 def _by_heading(right: Float64[np.ndarray, "n 3"], yaw_deg: Float64[np.ndarray, " n"]) -> Witness | None:
@@ -186,7 +186,7 @@ def _by_ground(
     if len(points) == 0:
         return None
     flying = height_m > FLYING_M
-    vertical = abs(float(mean[2])) > VERTICAL and abs(float(np.median(cameras) - np.median(points))) > FLYING_M
+    vertical = abs(float(mean[2])) > MIN_VERTICAL_PART and abs(float(np.median(cameras) - np.median(points))) > FLYING_M
     flying |= vertical and not np.isfinite(height_m).any()
     if flying.sum() < MIN_PHOTOS:
         return None

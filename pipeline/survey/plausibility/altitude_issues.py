@@ -18,7 +18,7 @@ from splatpipe.pipeline.survey.positions.position_sources import MOST_DATUMS_M
 
 ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
 MIN_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
-FILE_STEP_M = 20.0  # of a file's altitudes off the photos' own: a drone's own are off by nearly as much
+FILE_STEP_M = 20.0  # between altitudes of a file and the photos' own: a drone's own are off by nearly as much
 
 
 def find_altitude_issues(positions: PositionList) -> list[CaptureIssue]:

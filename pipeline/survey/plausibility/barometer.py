@@ -18,11 +18,11 @@ from splatpipe.pipeline.survey.positions.position_sources import is_altitude
 
 STATED = ("file", "exif", "xmp")  # sources of altitudes; others are the heights above take-off, or the model's own
 CLIMB_M = 5.0  # spread of the heights above take-off that tells a scale: five times the barometer's error
-CLIMB_RATIO = 1.5  # of climbs, either way: barometers drift by metres, not by halves
-CLIMB_SIGMAS = 5.0  # of the ratio's standard deviation: altitudes of poor receivers climb by chance
-LIKE = 1.25  # a ratio within this of a cause's is that cause's
+MAX_CLIMB_RATIO = 1.5  # ratio of climbs, either way, that is sound: barometers drift by metres, not by halves
+CLIMB_SIGMAS = 5.0  # the ratio's least difference from 1: altitudes of poor receivers climb by chance
+CAUSE_RATIO = 1.25  # a ratio within this of a cause's is that cause's
 MIN_FLIGHTS = 3
-FIT = 0.6  # of the misfit as stated: a cause's must be less
+MAX_MISFIT_RATIO = 0.6  # misfit by a cause over that as stated: at most
 SIGN = Reading(
     "they are above the sea instead of below it",
     "Correct EXIF's GPSAltitudeRef or the sign in the file of positions; or give better altitudes in geo.txt.",
@@ -48,7 +48,7 @@ def climb_ratio(
     spread = float(theirs @ theirs)
     ratio = float(ours @ theirs) / spread
     sigma = float(np.linalg.norm(ours - ratio * theirs)) / math.sqrt(len(ours) * spread)
-    sound = 1.0 / CLIMB_RATIO <= ratio <= CLIMB_RATIO or abs(ratio - 1.0) <= CLIMB_SIGMAS * sigma
+    sound = 1.0 / MAX_CLIMB_RATIO <= ratio <= MAX_CLIMB_RATIO or abs(ratio - 1.0) <= CLIMB_SIGMAS * sigma
     return None if sound else ratio
 
 
@@ -100,8 +100,8 @@ def _cause(
     for factor, reading in CAUSES:
         if not is_altitude(middle / factor):
             continue
-        fits = np.linalg.norm(ours - factor * theirs) < FIT * np.linalg.norm(ours - theirs)
-        if factor * ratio > 0.0 and abs(math.log(ratio / factor)) < math.log(LIKE) and fits:
+        fits = np.linalg.norm(ours - factor * theirs) < MAX_MISFIT_RATIO * np.linalg.norm(ours - theirs)
+        if factor * ratio > 0.0 and abs(math.log(ratio / factor)) < math.log(CAUSE_RATIO) and fits:
             nearer = np.abs(ours - factor * theirs) < np.abs(ours - theirs)
             candidates.append((reading, Evidence(int(nearer.sum()), len(ours))))
     if not candidates:

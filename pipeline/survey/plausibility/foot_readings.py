@@ -12,7 +12,7 @@ from splatpipe.pipeline.survey.crs.readings import Evidence, Reading, plausible
 US_FOOT_M = 1200.0 / 3937.0
 FOOT_M = 0.3048
 SAME_UNIT = 1e-7  # relative: the two feet differ by 2e-6
-SIGMAS = 2.0  # of the positions: a smaller difference between the two readings shows in no position
+MIN_SHIFT_SIGMAS = 2.0  # shift between the readings, in the positions' sigmas: a smaller one shows in no position
 
 
 def other_foot(controlled: ControlResult) -> tuple[Reading, Evidence] | None:
@@ -31,7 +31,7 @@ def other_foot(controlled: ControlResult) -> tuple[Reading, Evidence] | None:
         return None
     other = FOOT_M if own == US_FOOT_M else US_FOOT_M
     shift = _moved(controlled, other / own)
-    if float(np.hypot(*shift)) < SIGMAS * float(np.median(stations.sigmas[:, 0])):
+    if float(np.hypot(*shift)) < MIN_SHIFT_SIGMAS * float(np.median(stations.sigmas[:, 0])):
         return None
     placed = controlled.placed
     cameras = placed.world_from_model.apply(placed.model.centres[stations.indices])

@@ -37,15 +37,15 @@ LAG_TURN_RAD = math.radians(15.0)  # a turn that a lag on a loop may explain, an
 HALF_TURN_RAD = math.radians(150.0)
 LEANING_RAD = math.radians(30.0)  # from the gimbal's up; what is more is told by the witnesses of up, too
 MIN_WITNESSES = 6
-OTHERS_SHARE = 0.4  # of the positions: so many that the others may be the wrong ones
+ODD_SHARE = 0.4  # share of the positions that are odd, above which the others may be the wrong ones
 CLOCK_S = 1.0  # EXIF's times are whole seconds
 DRONE_M_S, AIRCRAFT_M_S = 50.0, 150.0  # no survey is flown faster: drones, and manned aircraft (or unknown)
 OUTSIDE_KM = 100.0  # from the CRS's area of use: surveyors stay in their zone across a border
 DATUM_M, DATUM_SIGMAS = 20.0, 5.0  # control off the positions: more is another datum or CRS
-MISSHAPEN = 0.05  # of the control's width: tape and hand-held receivers do better, or are stated to be worse
-BASE_M = 3.0  # likewise, of positions stated to EXACT_M: modern datums differ by less, wrong bases and points by more
-SCALE_APART, SCALE_SIGMAS = 0.2, 5.0  # likewise, of the scale
-HEADING_APART_RAD = math.radians(20.0)  # likewise, of north
+MAX_MISFIT_SHARE = 0.05  # misfit over the control's width: tape and hand-held receivers do better, or say so
+BASE_M = 3.0  # control off positions stated to EXACT_M: modern datums differ by less, wrong bases and points by more
+MAX_LOG_SCALE, SCALE_SIGMAS = 0.2, 5.0  # scale by control over that by the positions: its logarithm, and in sigmas
+MAX_TURN_RAD = math.radians(20.0)  # angle between north by control and by the positions
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def report_contradictions(placed: Placed, report: Reporter) -> list[Contradictio
     """
     if placed.frame.origin is None:
         return []
-    found = [each for look in LOOKS for each in look(placed)]
+    found = [each for check in CHECKS for each in check(placed)]
     for each in found:
         report.warning(each.text, each.hint)
     return found
@@ -168,9 +168,9 @@ def _climbs(placed: Placed) -> Iterator[Contradiction]:
             "Check the scale of the result on a known length, and the positions' altitudes.",
         )
     if placed.controlled is None:  # else heights are the control's
-        told = altitude_climbs([placed.positions.by_name.get(name, {}) for name in placed.model.names])
-        if told is not None:
-            yield Contradiction(*told)
+        contradiction = altitude_climbs([placed.positions.by_name.get(name, {}) for name in placed.model.names])
+        if contradiction is not None:
+            yield Contradiction(*contradiction)
 
 
 def _speed(placed: Placed) -> Iterator[Contradiction]:
@@ -234,7 +234,7 @@ def _left_out(placed: Placed) -> Iterator[Contradiction]:
         return
     stated = placed.positions.by_name.keys() & set(placed.model.names)
     odd = len(stated & set(placed.frame.left_out))
-    if odd >= MIN_WITNESSES and odd >= OTHERS_SHARE * len(stated):
+    if odd >= MIN_WITNESSES and odd >= ODD_SHARE * len(stated):
         yield Contradiction(
             f"{odd} of {len(stated)} stated positions do not fit the others, and are left out.",
             "Check which of them are right: if it is those, the result is in the wrong place.",
@@ -318,7 +318,7 @@ def _agreement(placed: Placed) -> Iterator[Contradiction]:
     targets = controlled.site.targets
     apart = controlled.sigma_factor * float(np.median(targets.sigmas[chosen, 0]))
     extent = float(np.linalg.norm(np.ptp(targets.enu[chosen, :2], axis=0)))
-    if apart > MISSHAPEN * extent:
+    if apart > MAX_MISFIT_SHARE * extent:
         yield Contradiction(
             f"The control points of {controlled.survey.name} agree with the photos to {apart:.1f} m only,"
             f" {apart / extent:.0%} of the width of their area.",
@@ -332,7 +332,7 @@ def _shape(ours: Similarity, alone: Frame, name: str) -> Iterator[Contradiction]
     theirs = alone.world_from_model
     ratio = ours.scale / theirs.scale
     sigma = SCALE_SIGMAS * float(alone.residuals["sigma_scale_percent"]) / 100.0
-    if abs(math.log(ratio)) > max(SCALE_APART, sigma):
+    if abs(math.log(ratio)) > max(MAX_LOG_SCALE, sigma):
         yield Contradiction(
             f"By the control of {name}, lengths are {ratio:.2f} times those by the photos' positions.",
             "Check the unit of its coordinates, and its CRS.",
@@ -340,14 +340,14 @@ def _shape(ours: Similarity, alone: Frame, name: str) -> Iterator[Contradiction]
     turn = ours.rotation @ theirs.rotation.T
     angle = math.acos(min(1.0, max(-1.0, (float(np.trace(turn)) - 1.0) / 2.0)))
     spread = math.radians(SCALE_SIGMAS * float(alone.residuals["sigma_rotation_deg"]))
-    if angle > max(HEADING_APART_RAD, spread):
+    if angle > max(MAX_TURN_RAD, spread):
         yield Contradiction(
             f"The control of {name} turns the model by {math.degrees(angle):.0f}° against the photos' positions.",
             "Check the order and signs of its coordinates, and that names and marks match.",
         )
 
 
-LOOKS: tuple[Callable[[Placed], Iterator[Contradiction]], ...] = (
+CHECKS: tuple[Callable[[Placed], Iterator[Contradiction]], ...] = (
     _up,
     _north,
     _control,

@@ -25,7 +25,7 @@ CONTRADICTION_M = 1.0  # between a photo's EXIF and XMP: too large for rounding
 CONTRADICTION_TIMES = 6.0  # times the difference in most photos, whose EXIF may have been post-processed (PPK)
 ANOTHER_PLACE_M = 10.0  # in most photos: too large for a correction
 WELL_KNOWN_M = 0.1  # a standard deviation up to this is RTK's
-RTK_SHARE = 0.5  # of the photos with a fix: above, the others have lost it
+MIN_RTK_SHARE = 0.5  # share of photos with a fix above which the others have lost it
 MIN_REPEATS = 6  # photos
 
 
@@ -242,10 +242,10 @@ def _headings(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[C
 def _contradicting(photos: Sequence[CheckedPhoto], positions: PositionList) -> list[CaptureIssue]:
     """Photos whose EXIF and XMP state different positions, where most photos' agree."""
     apart: dict[str, float] = {}
-    settled = positions.doubts.frozen | positions.doubts.by_xmp
+    resolved = positions.doubts.frozen | positions.doubts.by_xmp
     for photo in photos:
         gps, other = photo.exif.gps, xmp_place(photo.xmp)
-        if photo.name in settled or gps is None or other is None or not is_on_earth(gps.latitude, gps.longitude):
+        if photo.name in resolved or gps is None or other is None or not is_on_earth(gps.latitude, gps.longitude):
             continue
         if is_on_earth(other.latitude, other.longitude):
             places = [(gps.latitude, gps.longitude)], [(other.latitude, other.longitude)]
@@ -271,7 +271,7 @@ def _lost_fix(positions: Sequence[Position]) -> list[CaptureIssue]:
         return []
     fixed = {each.name: _is_fixed(each) for each in positions}
     lost = tuple(name for name, has in fixed.items() if not has)
-    if not lost or len(lost) > (1.0 - RTK_SHARE) * len(positions):
+    if not lost or len(lost) > (1.0 - MIN_RTK_SHARE) * len(positions):
         return []
     sigmas: Mapping[str, float] = {each.name: each.sigma_horizontal_m for each in positions}
     worst = max(sigmas[name] for name in lost)

@@ -15,7 +15,7 @@ from splatpipe.pipeline.survey.files.control_file import SurveyedPoint
 from splatpipe.pipeline.survey.placing.model import SparseModel
 
 MARK_TOLERANCE = 10.0  # times the marks' sigma
-MIN_TOLERANCE_PX = 5.0  # of marks: SfM's own errors at the edge of a photo
+MIN_TOLERANCE_PX = 5.0  # least error of a mark to be wrong: SfM's own errors at the edge of a photo
 FIT_TOLERANCE = 8.0  # times the model's mean reprojection error
 
 

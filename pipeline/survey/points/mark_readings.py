@@ -12,8 +12,8 @@ from splatpipe.pipeline.survey.files.control_file import SurveyedPoint
 from splatpipe.pipeline.survey.placing.model import SparseModel
 from splatpipe.pipeline.survey.points.located_points import Sighting, SurveyPoint, locate
 
-MOST_DISAGREE = 0.5  # of the marks that can contradict: where fewer agree, those that do agree by chance
-MAX_POINTS, MAX_MARKS = 12, 8  # of each point, that other readings are tried on: half a second each
+MIN_AGREEING_SHARE = 0.5  # share of the marks that could contradict: if fewer agree, they do so by chance
+MAX_POINTS, MAX_MARKS = 12, 8  # points, and marks of each, that other readings are tried on: half a second each
 Pixel = tuple[float, float]
 Rewrite = Callable[[float, float, float, float], Pixel]
 
@@ -154,7 +154,7 @@ def require_agreement(
         SplatpipeError: if they do; the hint names the convention that explains them, if one does.
     """
     found = _sum([_witnesses(point, len(_posed(point.sightings))) for point in located])
-    if found.of < MIN_CONTRADICTING or found.share >= MOST_DISAGREE:
+    if found.of < MIN_CONTRADICTING or found.share >= MIN_AGREEING_SHARE:
         return
     off = sum(1 for point in located for each in _posed(point.sightings) if point.found is None or not each.agrees)
     count = sum(len(_posed(point.sightings)) for point in located)

@@ -13,7 +13,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.files.names import NameFinder, list_names, without_zeros
 from splatpipe.pipeline.photos.files.photo_list import Photo
 from splatpipe.pipeline.survey.crs.crs import Crs
-from splatpipe.pipeline.survey.crs.readings import EXPLAINED
+from splatpipe.pipeline.survey.crs.readings import MIN_EXPLAINED_SHARE
 from splatpipe.pipeline.survey.files.control_file import ControlFile, read_control_file, titled
 from splatpipe.pipeline.survey.options import GeorefConfig
 from splatpipe.pipeline.survey.placing.model import SparseModel
@@ -22,7 +22,7 @@ from splatpipe.pipeline.survey.points.mark_readings import Marks, named_reading,
 
 MIN_FOR_CHECKS = 6  # points: with at least as many, some are kept as check points
 EVERY_NTH = 3  # point becomes a check point
-OUTSIDE_SHARE = 0.3  # of the marks outside their photos: above, they were made in photos of another size
+MAX_OUTSIDE_SHARE = 0.3  # share of marks outside their photos, above which they were made in photos of another size
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def _sightings(
                 outside.append(f"{point.name} in {photo}")
         result.append(seen)
     count = sum(len(point.marks) for point in file.points)
-    if len(outside) > OUTSIDE_SHARE * count:
+    if len(outside) > MAX_OUTSIDE_SHARE * count:
         cause = named_reading(marks, model, photos, config.mark_sigma_px)
         hint = "Were they made in photos that were resized or rotated? Pixel coordinates must be in these photos."
         raise SplatpipeError(
@@ -218,7 +218,7 @@ def eaten_zeros(missing: Sequence[str], known: Iterable[str], what: str = "photo
     find = NameFinder(sorted(known))
     bare = NameFinder(sorted({without_zeros(name) for name in known}))
     back = [name for name in missing if find(name) is None and bare(without_zeros(name)) is not None]
-    if len(back) < EXPLAINED * max(len(missing), 1):
+    if len(back) < MIN_EXPLAINED_SHARE * max(len(missing), 1):
         return ""
     return (
         f"Without leading zeros, {list_names(back, 3)} would be {what} of this capture: a spreadsheet drops the zeros"

@@ -15,8 +15,8 @@ MIN_PHOTOS = 6
 LONG_STEP, LONG_PAUSE = 2.2, 2.5  # times the usual ones: at least two photos are missing
 BY_NUMBER_PAUSE = 2.2  # suffices where numbers are missing, too
 MIN_NUMBERS = 2  # missing, to report a gap
-REGULAR = 0.8  # of the names increase by one: then a skipped number is evidence
-SPEEDS = (0.5, 2.0)  # of the usual speed: slower is a pause or a battery change; faster means the times are wrong
+REGULAR_SHARE = 0.8  # share of names that increase by one, above which a skipped number is evidence
+SPEED_RATIOS = (0.5, 2.0)  # bounds over the usual speed: slower is a pause, faster means that times are wrong
 LONGEST_TURN = 1.3  # times the longest step between two flight lines elsewhere: no turn is as long
 TURN_STEP = 1.5  # times the usual step: a longer one leads to the next flight line
 AHEAD = 0.1  # cosine between the path before, the gap, and the path after: an orbit turns by as much in four photos
@@ -67,14 +67,14 @@ def find_missing(names: Sequence[str], flight: PositionEvidence) -> list[Missing
         skipped = 0
         if numbers is not None:
             skipped = numbers[int(order[k + 1])] - numbers[int(order[k])] - 1
-        counted = MIN_NUMBERS <= skipped <= FURTHEST_MISSING
-        missing = skipped if counted else round(float(pauses[k]) / pause) - 1
-        is_gap = counted and pauses[k] > BY_NUMBER_PAUSE * pause
+        by_number = MIN_NUMBERS <= skipped <= FURTHEST_MISSING
+        missing = skipped if by_number else round(float(pauses[k]) / pause) - 1
+        is_gap = by_number and pauses[k] > BY_NUMBER_PAUSE * pause
         leads_on = _goes_on(way, k, usual) or steps[k] > max(LONG_STEP * usual, LONGEST_TURN * _other_turns(steps, k))
         is_gap |= leads_on and _as_fast(steps[k] / pauses[k], usual / pause, pauses[k] / pause)
         if is_gap and 2 <= missing <= FURTHEST_MISSING:
             pair = int(order[k]), int(order[k + 1])
-            found.append(MissingStrip(*pair, int(missing), float(steps[k]), usual, counted))
+            found.append(MissingStrip(*pair, int(missing), float(steps[k]), usual, by_number))
     return found
 
 
@@ -96,7 +96,7 @@ def _other_turns(steps: Float64[np.ndarray, " m"], k: int) -> float:
 
 
 def _as_fast(speed: float, usual: float, pauses: float) -> bool:
-    return bool(SPEEDS[0] * usual < speed < SPEEDS[1] * usual and pauses > LONG_PAUSE)
+    return bool(SPEED_RATIOS[0] * usual < speed < SPEED_RATIOS[1] * usual and pauses > LONG_PAUSE)
 
 
 def _by_numbers(names: Sequence[str], numbers: Sequence[int] | None, flight: PositionEvidence) -> list[MissingStrip]:
@@ -120,4 +120,4 @@ def _numbers(names: Sequence[str]) -> list[int] | None:
         return None
     numbers = [int(match.group(1)) for match in found if match is not None]
     steps = np.diff(numbers)
-    return numbers if len(steps) and float(np.mean(steps == 1)) >= REGULAR else None
+    return numbers if len(steps) and float(np.mean(steps == 1)) >= REGULAR_SHARE else None

@@ -15,7 +15,7 @@ from splatpipe.pipeline.photos.files.photo_list import Photo
 
 MIN_STEPS = 6  # fewer agree by chance
 MIN_STEP_M = 3.0  # receivers err by less from one photo to the next
-STEADY_COSINE = math.cos(math.radians(20.0))  # of the headings at both ends: no turn in between
+STEADY_COSINE = math.cos(math.radians(20.0))  # between the headings at both ends of a straight step: no turn in between
 ALIGNED, SCATTERED = 0.9, 0.7  # length of the mean of headings' differences as unit vectors: they agree, or do not
 AHEAD_RAD, ASKEW_RAD, BACKWARDS_RAD = (math.radians(angle) for angle in (45.0, 75.0, 110.0))  # sideways is 90°
 Relation = Literal["same", "ahead", "askew", "backwards", "mirrored"]

@@ -20,8 +20,8 @@ TAKEOFF_STEP_M = 1.0  # smaller steps are barometer drift
 TAKEOFF_NOISES = 6.0  # times the spread within a flight: noisy altitudes must not start new flights
 MIN_PLATEAU = 3  # photos on each side needed to judge a step of the take-off altitude
 CANDIDATES = 20  # steps between neighbours that are examined, the largest first
-MAX_FLIGHTS = 1000  # of one device without a pause: more are implausible, and cost time
-MAD_TO_SIGMA = 1.4826  # of Gaussian noise
+MAX_FLIGHTS = 1000  # flights of one device without a pause: more are implausible, and cost time
+MAD_TO_SIGMA = 1.4826  # standard deviation of Gaussian noise over its median absolute deviation
 
 
 @dataclass(frozen=True)

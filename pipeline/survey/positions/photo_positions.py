@@ -43,8 +43,8 @@ FLOAT = range(32, 50)
 # Horizontal (per axis) and vertical standard deviations, metres, where a photo does not state its own.
 DEFAULT_SIGMAS_M = {"fixed": (0.02, 0.03), "float": (0.5, 1.0), "single": (3.0, 5.0), None: (3.0, 5.0)}
 MIN_SIGMA_M = 0.005  # smaller stated accuracies are the receiver's noise, not the accuracy of the camera's position
-VERTICAL_OVER_HORIZONTAL = 1.5  # of GNSS errors, where only the horizontal one is stated
-BAROMETER_SIGMA_M = 1.0  # of heights above take-off, whatever the receiver's accuracy
+VERTICAL_OVER_HORIZONTAL = 1.5  # ratio of GNSS errors, where only the horizontal one is stated
+BAROMETER_SIGMA_M = 1.0  # sigma of heights above take-off, whatever the receiver's accuracy
 DATUM_STEP_M = 1.0  # EXIF and XMP altitudes further apart than this are not roundings of one value
 NOWHERE = "states a position that is none on Earth"
 

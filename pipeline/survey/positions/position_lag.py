@@ -16,9 +16,9 @@ from splatpipe.pipeline.survey.positions.flight_steps import MIN_STEPS, FlightSt
 
 LAGS = np.arange(-12, 13) / 4.0  # photos
 MIN_LAG = 0.5  # photos; shutters and cables make a tenth
-SIGMAS = 2.0  # of the positions: a smaller lag is not worth a word
-NEAR = 0.5  # of the lag's way: a photo that is off by less sits where it should
-ROUNDS = 20  # of reweighting, to the least sum of distances
+MIN_WAY_SIGMAS = 2.0  # way of the lag in sigmas of the positions: a smaller one is not worth a word
+NEAR_SHARE = 0.5  # distance over the lag's way up to which a photo sits where it should
+ROBUST_ROUNDS = 20  # rounds of reweighting, to the least sum of distances
 MIN_WEIGHT_M = 0.01
 
 
@@ -57,8 +57,8 @@ def position_lag(
         )
     best = min(misfits, key=lambda lag: (float(np.median(misfits[lag])), abs(lag)))
     step = float(np.median(np.abs(np.concatenate([np.diff(placed[run] @ np.array([1.0, 1.0j])) for run in runs]))))
-    reach = NEAR * abs(best) * step
-    if abs(best) < MIN_LAG or reach < NEAR * SIGMAS * sigma_m:
+    reach = NEAR_SHARE * abs(best) * step
+    if abs(best) < MIN_LAG or reach < NEAR_SHARE * MIN_WAY_SIGMAS * sigma_m:
         return None
     evidence = {lag: Evidence(int((misfits[lag] <= reach).sum()), len(misfits[lag])) for lag in (0.0, best)}
     named = plausible(evidence[0.0], [(_reading(best, float(np.median(steps.seconds))), evidence[best])])
@@ -102,7 +102,7 @@ def _misfits(
     """Distances that remain after a plane similarity, which may turn or not, fitted so that their sum is least."""
     weights = np.ones(len(ours))
     off = np.zeros(len(ours), dtype=np.complex128)
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_ROUNDS):
         share = weights / weights.sum()
         a, b = ours - share @ ours, theirs - share @ theirs
         factor = np.vdot(a, share * b) / max(float((share * np.abs(a) ** 2).sum()), 1e-300)

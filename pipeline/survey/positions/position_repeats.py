@@ -14,8 +14,8 @@ from splatpipe.pipeline.survey.positions.position_sources import PLACE_DIGITS, s
 
 MIN_COPIED = 6  # photos of one latitude or longitude: fewer may lie on a line by chance
 MIN_PLACES = 3  # in the other coordinate
-PLACE_SHARE = 0.2  # of the photos, at least, at each of two places; fewer are outliers
-APART = 5.0  # times the extent of either place
+MIN_PLACE_SHARE = 0.2  # share of the photos, at least, at each of two places; fewer are outliers
+MIN_GAP_RATIO = 5.0  # times the extent of either place
 
 
 def copied_coordinate(places: Sequence[tuple[float, float]]) -> str:
@@ -46,7 +46,7 @@ def two_places(places: Sequence[tuple[float, float]]) -> tuple[int, int, float] 
     at = int(np.argmax(np.diff(along))) + 1
     gap = float(along[at] - along[at - 1])
     extent = max(float(np.ptp(along[:at])), float(np.ptp(along[at:])))
-    if gap <= max(FAR_M, APART * extent) or min(at, len(along) - at) < PLACE_SHARE * len(along):
+    if gap <= max(FAR_M, MIN_GAP_RATIO * extent) or min(at, len(along) - at) < MIN_PLACE_SHARE * len(along):
         return None
     return at, len(along) - at, gap
 

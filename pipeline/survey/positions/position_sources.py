@@ -19,7 +19,7 @@ from splatpipe.pipeline.photos.metadata.exif import Gps
 from splatpipe.pipeline.photos.metadata.xmp import xmp_number
 
 ALTITUDE_BOUNDS_M = (-450.0, 9000.0)  # from the shore of the Dead Sea (-440 m) to above the highest summit
-RELATIVE_BOUNDS_M = (-1000.0, 20_000.0)  # of heights above take-off
+RELATIVE_BOUNDS_M = (-1000.0, 20_000.0)  # heights above take-off, least and largest
 NULL_ISLAND_DEG = 1e-6  # receivers without a fix write 0, 0
 PLACE_DIGITS = 8  # degrees: positions equal to a millimetre are one position
 MIN_REPEATED = 3  # photos at one position: two may have been taken on the spot
@@ -27,7 +27,7 @@ MOST_DATUMS_M = 150.0  # vertical datums differ by up to 110 m (geoid) and some 
 ELSEWHERE_M = 20.0  # between two sources' positions: too large for a correction, or for a receiver's error
 SAME_ALTITUDE_M = 1.0  # two statements of one altitude, but for rounding
 TAKEOFF_M = 3.0  # EXIF's altitude less the height above take-off, if it states that
-CAUSE_SHARE, CAUSE_PHOTOS = 0.8, 6  # of the photos, that a cause must explain to be acted on
+MIN_CAUSE_SHARE, MIN_CAUSE_PHOTOS = 0.8, 6  # share and number of photos that a cause must explain to be acted on
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
     vague = {each.name for each in photos if _is_usable(each.exif.gps) and not _of(each).hemispheres}
     by_xmp = {name for name in vague if _is_usable(xmp_place(by_name[name].xmp))}
     zero, sign, above_takeoff = _zero(photos), _wrong_sign(photos), _above_takeoff(photos)
-    settled = []
+    corrected = []
     for photo in photos:
         gps = photo.exif.gps
         if gps is not None:
@@ -79,7 +79,7 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
             if name in frozen | by_xmp:
                 gps = replace(gps, void=True)
             photo = replace(photo, exif=replace(photo.exif, gps=gps))
-        settled.append(photo)
+        corrected.append(photo)
     doubts = SourceDoubts(
         frozenset(frozen),
         frozenset(vague - by_xmp),
@@ -87,10 +87,10 @@ def settle_sources(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], 
         frozenset(sign),
         frozenset(above_takeoff),
         frozenset(zero),
-        {each.name: _of(each).datum for each in settled if _is_usable(each.exif.gps) and _of(each).datum},
-        _impossible(settled),
+        {each.name: _of(each).datum for each in corrected if _is_usable(each.exif.gps) and _of(each).datum},
+        _impossible(corrected),
     )
-    return settled, doubts
+    return corrected, doubts
 
 
 def stated_places(photos: Sequence[CheckedPhoto]) -> dict[str, tuple[float, float]]:
@@ -201,7 +201,7 @@ def _wrong_sign(photos: Sequence[CheckedPhoto]) -> set[str]:
     wrong = {name for name, (stated, turned) in apart.items() if stated > MOST_DATUMS_M and turned <= MOST_DATUMS_M / 2}
     wrong = {name for name in wrong if 4.0 * apart[name][1] < apart[name][0]}
     near = {name for name, (stated, turned) in apart.items() if turned <= SAME_ALTITUDE_M < stated / 2.0}
-    if near and len(near) >= CAUSE_SHARE * len(pairs):
+    if near and len(near) >= MIN_CAUSE_SHARE * len(pairs):
         values = np.array([pairs[name] for name in near])
         if np.std(values[:, 0] + values[:, 1]) <= np.std(values[:, 0] - values[:, 1]):
             wrong |= near
@@ -215,7 +215,7 @@ def _above_takeoff(photos: Sequence[CheckedPhoto]) -> set[str]:
     explained = {
         name for name, exif in far.items() if (height := heights[name]) is not None and abs(exif - height) <= TAKEOFF_M
     }
-    return explained if len(explained) >= max(CAUSE_PHOTOS, CAUSE_SHARE * len(far)) else set()
+    return explained if len(explained) >= max(MIN_CAUSE_PHOTOS, MIN_CAUSE_SHARE * len(far)) else set()
 
 
 def _impossible(photos: Sequence[CheckedPhoto]) -> dict[str, float]:

@@ -16,7 +16,7 @@ from splatpipe.pipeline.sfm.pairing.pairs import Pair
 
 FURTHEST = 4.0  # times the usual distance of photos that match: a false match must not outweigh all others
 MIN_PARTNERS = 3  # that each of the two matches
-MIN_NEARER = 0.02  # of the two photos' distances to their partners; right ones give 0.003 at most
+MIN_NEARER = 0.02  # reduction of two photos' distances to their partners, relative; right ones give 0.003 at most
 CLEARLY_NEARER = 0.08  # where no times give the path
 MIN_SHORTER, CLEARLY_SHORTER = 0.3, 1.5  # reduction of the path, in usual steps between two photos
 HARDLY_NEARER = 0.008  # suffices where the path is clearly shorter
@@ -115,7 +115,7 @@ def _shorter(places: Float64[np.ndarray, "n 3"], order: Int64[np.ndarray, " m"])
     cost[:-1] += distances[1:]
     own = np.diagonal(cost)
     gain = own[:, None] + own[None, :] - cost - cost.T
-    beside = np.arange(count - 1)  # of neighbours, the step between them stays as long as it is
+    beside = np.arange(count - 1)  # two neighbours: the step between them stays as long as it is
     correction = 2.0 * steps
     gain[beside, beside + 1] -= correction
     gain[beside + 1, beside] -= correction

@@ -24,7 +24,7 @@ MIN_RADIUS_M = 8.0  # consumer receivers share an error of several metres, whate
 RADIUS_SIGMAS = 4.0
 NEAR_M = 15.0  # radius around a point in which sparse points give the ground's height
 MIN_NEAR = 5
-WHOLE = 0.6  # of a photo's area: a larger window becomes the whole photo
+WHOLE_PHOTO_SHARE = 0.6  # share of a photo's area above which a window becomes the whole photo
 
 
 def expected_windows(
@@ -120,11 +120,11 @@ def _window(
     pixels = middle + focal * seen[:, :2] / seen[:, 2:]
     low, high = np.maximum(pixels - reach[:, None], 0.0), pixels + reach[:, None]
     high = np.minimum(high, [photo.width, photo.height])
-    shown = (high - low > 1.0).all(axis=1)
-    if not shown.any():
+    visible = (high - low > 1.0).all(axis=1)
+    if not visible.any():
         return None
-    left, top = np.floor(low[shown].min(axis=0)).astype(int).tolist()
-    right, bottom = np.ceil(high[shown].max(axis=0)).astype(int).tolist()
-    if (right - left) * (bottom - top) > WHOLE * photo.width * photo.height:
+    left, top = np.floor(low[visible].min(axis=0)).astype(int).tolist()
+    right, bottom = np.ceil(high[visible].max(axis=0)).astype(int).tolist()
+    if (right - left) * (bottom - top) > WHOLE_PHOTO_SHARE * photo.width * photo.height:
         return 0, 0, photo.width, photo.height
     return left, top, right, bottom

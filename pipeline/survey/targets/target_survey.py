@@ -155,7 +155,7 @@ def scaled(frame: Frame, scale: ModelScale) -> Frame:
     old = frame.world_from_model
     similarity = Similarity(old.scale * factor, old.rotation, old.translation * factor)
     upright = frame.note.partition(" Up is")[2]
-    note = f"Metres by {_counted(scale)}, good to {scale.sigma:.2%}; place and heading are arbitrary. Up is"
+    note = f"Metres by {_bars_text(scale)}, good to {scale.sigma:.2%}; place and heading are arbitrary. Up is"
     return replace(frame, world_from_model=similarity, metres=True, note=note + upright)
 
 
@@ -169,7 +169,7 @@ def compare(frame: Frame, scale: ModelScale, report: Reporter, adjusted: bool = 
         adjusted: Whether the bars took part in the adjustment.
     """
     ratio = frame.world_from_model.scale / scale.metres_per_unit - 1.0
-    bars = f"{_counted(scale)} (good to {scale.sigma:.3%})"
+    bars = f"{_bars_text(scale)} (good to {scale.sigma:.3%})"
     what = f"According to {bars}, lengths in this result are {ratio:+.3%} off."
     if adjusted:
         what = f"After the adjustment, which {bars} took part in, lengths are {ratio:+.3%} off theirs."
@@ -187,9 +187,9 @@ def scale_json(bars: Sequence[ScaleBar], scale: ModelScale | None, frame: Frame)
     if scale is None:
         return {}
     ratio = frame.world_from_model.scale / scale.metres_per_unit
-    sentence = f"its metres are those of {_counted(scale)}, good to {scale.sigma:.2%} where they lie."
+    sentence = f"its metres are those of {_bars_text(scale)}, good to {scale.sigma:.2%} where they lie."
     if frame.origin is not None:
-        sentence = f"by {_counted(scale)} (good to {scale.sigma:.2%}) lengths are {ratio - 1.0:+.2%} off."
+        sentence = f"by {_bars_text(scale)} (good to {scale.sigma:.2%}) lengths are {ratio - 1.0:+.2%} off."
     rows = [
         {
             "a": bar.a,
@@ -204,7 +204,7 @@ def scale_json(bars: Sequence[ScaleBar], scale: ModelScale | None, frame: Frame)
     return {"scale": {"metric": True, "placed": placed, "sentence": sentence, "sigma": scale.sigma, "bars": rows}}
 
 
-def _counted(scale: ModelScale) -> str:
+def _bars_text(scale: ModelScale) -> str:
     return f"{len(scale.used)} scale bar{'' if len(scale.used) == 1 else 's'}"
 
 

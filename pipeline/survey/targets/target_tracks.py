@@ -18,7 +18,7 @@ MIN_TOLERANCE_PX = 3.0
 FIT_TOLERANCE = 4.0  # times the model's mean reprojection error
 MIN_UNNAMED = 3  # photos of a target without a number: two rays can meet by chance
 MIN_CODED = 2
-MAX_PARTNERS = 40  # of a detection that are tried as hypotheses
+MAX_PARTNERS = 40  # partners of a detection that are tried as hypotheses
 MAX_SEEDS = 4000
 BEYOND = 2.0  # factor by which a target may be farther or nearer than the sparse points in a photo
 
@@ -126,9 +126,9 @@ def _reach(seen: _PosedFinds, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
     depths: dict[str, tuple[float, float]] = {}
     for name, number in zip(model.names, model.image_ids, strict=True):
         image = model.reconstruction.images[number]
-        shown = [model.reconstruction.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]
+        observed = [model.reconstruction.points3D[p.point3D_id].xyz for p in image.points2D if p.has_point3D()]
         pose = np.asarray(image.cam_from_world().matrix(), np.float64)
-        depth = np.array(shown).reshape(-1, 3) @ pose[2, :3] + pose[2, 3]
+        depth = np.array(observed).reshape(-1, 3) @ pose[2, :3] + pose[2, 3]
         low, high = np.percentile(depth, [1.0, 99.0]) if len(depth) else (0.0, np.inf)
         depths[name] = float(low) / BEYOND, float(high) * BEYOND
     return np.array([depths[find.photo] for find in seen.finds])
@@ -151,8 +151,8 @@ def _group(
     cameras, pixels, rays = (v[partners] for v in (seen.rays.cam_from_world, seen.rays.pixels, seen.rays.rays))
     there = np.einsum("nij,nj->ni", cameras[:, :, :3], points) + cameras[:, :, 3]
     ahead = there[:, 2] > 0.0
-    shown = there[:, :2] / np.where(ahead, there[:, 2], 1.0)[:, None]
-    gap = np.where(ahead, np.linalg.norm(np.einsum("nij,nj->ni", pixels, shown - rays), axis=1), np.inf)
+    projected = there[:, :2] / np.where(ahead, there[:, 2], 1.0)[:, None]
+    gap = np.where(ahead, np.linalg.norm(np.einsum("nij,nj->ni", pixels, projected - rays), axis=1), np.inf)
     meets = (depth > reach[seed, 0]) & (depth < reach[seed, 1]) & (gap < seen.tolerance_px) & (sine > 3e-4)
     for point in points[meets][:MAX_PARTNERS]:
         errors = np.linalg.norm(seen.rays.residuals_px(point), axis=1)

@@ -304,7 +304,7 @@ def test_a_splat_of_another_run_is_merged_at_its_place_on_earth(tmp_path: Path, 
     added = merged.gaussians.after(len(few.gaussians))
     assert float((added.means - scene.gaussians.means).abs().max()) < 5e-4  # float32 at 1.8 km: 0.12 mm an axis
     camera = cameras(3)[1]
-    assert decibels(view(scene, camera), view(Scene(added), camera)) >= 45.0  # of what was rounded there
+    assert decibels(view(scene, camera), view(Scene(added), camera)) >= 45.0  # PSNR against what was rounded
 
 
 def test_degrees_of_harmonics_may_differ(tmp_path: Path):

@@ -8,6 +8,6 @@ CODE = "timeit"  # runs its arguments as statements; the first of them is our pr
 
 
 def test_they_run_to_completion_and_their_memory_is_reported() -> None:
-    looks = []
-    peak = run_children([(CODE, "pass"), (CODE, "pass")], lambda: looks.append(1), "idling")
-    assert looks and peak > 2 * 4 << 20  # two interpreters
+    calls = []
+    peak = run_children([(CODE, "pass"), (CODE, "pass")], lambda: calls.append(1), "idling")
+    assert calls and peak > 2 * 4 << 20  # two interpreters

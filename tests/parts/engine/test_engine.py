@@ -311,9 +311,9 @@ def test_how_a_run_and_its_stages_ended_is_in_the_events(numbers: Path, out: Pat
         assert failed["lasting"] is False
 
 
-@pytest.mark.parametrize(("meddled", "lasting"), [("", True), ("gone", False), ("another", False)])
+@pytest.mark.parametrize(("meddled", "remembered"), [("", True), ("gone", False), ("another", False)])
 def test_a_failure_due_to_the_photos_is_remembered_until_they_change(
-    numbers: Path, out: Path, meddled: str, lasting: bool
+    numbers: Path, out: Path, meddled: str, remembered: bool
 ) -> None:
     """If a folder was temporarily missing or still being written, the next run may succeed."""
     for path in numbers.glob("*.txt"):
@@ -329,7 +329,7 @@ def test_a_failure_due_to_the_photos_is_remembered_until_they_change(
         runner.walk()
     events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
     (failed,) = (event["data"] for event in events if event["kind"] == "stage_failed")
-    assert (failed["exit_code"], failed["lasting"]) == (1, lasting)
+    assert (failed["exit_code"], failed["lasting"]) == (1, remembered)
 
 
 def test_hostile_names_do_no_harm(numbers: Path, out: Path) -> None:

@@ -126,8 +126,8 @@ def test_no_name_sends_colours_or_commands_to_the_terminal(capfd: pytest.Capture
     console(Event("warning", "train", {"message": hostile, "hint": hostile}))
     console(Event("stage_failed", "train", {"message": hostile}))
     console.close()
-    shown = capfd.readouterr().err
-    assert not {"\x1b", "\x07", "\x9b"} & set(shown) and shown.count("[bold]") >= 5
+    output = capfd.readouterr().err
+    assert not {"\x1b", "\x07", "\x9b"} & set(output) and output.count("[bold]") >= 5
 
 
 def test_time_left_is_that_of_the_step_and_unknown_until_it_advances(
@@ -152,8 +152,8 @@ def test_time_left_is_that_of_all_shards_unless_one_is_made_alone(
     console(Event("stage_started", "train.2", {"reason": "", "shard": {"number": 2, "count": 4}}))
     console(Event("progress", "train.2", {"done": 5.0, "total": 10.0, "what": "training", "unit": "iterations"}))
     console.close()
-    shown = " ".join(capfd.readouterr().err.split())
-    assert "5/10 iterations" in shown and ("including the 2 remaining" in shown) == mentions_rest
+    output = " ".join(capfd.readouterr().err.split())
+    assert "5/10 iterations" in output and ("including the 2 remaining" in output) == mentions_rest
 
 
 def test_an_internal_error_is_reported_even_without_a_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -141,7 +141,7 @@ def test_depths_are_within_a_hundredth_and_nothing_is_found_without_texture() ->
 def test_points_are_added_on_the_walls_where_there_were_none(room: Path, points: DensePoints) -> None:
     off_wall = np.abs(points.xyz).min(axis=1)
     assert len(points) > 500
-    assert np.median(off_wall) < 0.01  # of 3 to 4 m to the cameras
+    assert np.median(off_wall) < 0.01  # metres, with cameras at 3 to 4 m
     assert np.percentile(off_wall, 99) < 0.04
     assert points.xyz.min() > -0.05 and points.xyz.max() < ROOM_M + 0.05
     assert (points.xyz.max(axis=1) > SPARSE_M).mean() > 0.6

@@ -11,7 +11,7 @@ from on_cpu import kernels_on_cpu
 from splatpipe.pipeline.raster.cuda.cuda import use_kernels
 from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 
-ATOL = 2e-6  # of colours up to 1, and of sums over 15 x 15 pixels with weights up to 1
+ATOL = 2e-6  # colours are at most 1, and sums go over 15 x 15 pixels with weights up to 1
 
 
 DEVICE_ATOL = 1e-3  # there the place between two cells is float32, the CPU's is float64; of sums of hundreds

@@ -19,7 +19,7 @@ PLAN = GroundPlan.across(np.array([0.0, 0.0, 1.0]))
 BORDERS = (PlanLine((22.1, 1.0), (22.1, 23.0)), PlanLine((2.0, 11.3), (46.0, 11.3)))  # over grass; across both houses
 
 
-PIXEL = building_site.HEIGHT / (2.0 * building_site.FOCAL)  # of the cameras below, metres
+PIXEL = building_site.HEIGHT / (2.0 * building_site.FOCAL)  # size of a pixel of the cameras below, metres
 
 
 @pytest.fixture(scope="module")

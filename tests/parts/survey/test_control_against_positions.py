@@ -67,12 +67,12 @@ def test_control_beside_the_photos_is_told(tmp_path: Path) -> None:
     assert "m horizontally off the photos' positions" in said and "EPSG:32633" in said
 
 
-@pytest.mark.parametrize(("kind", "metres", "told"), [("rtk", 5.0, True), ("rtk", 2.0, False), ("gps", 5.0, False)])
+@pytest.mark.parametrize(("kind", "metres", "reported"), [("rtk", 5.0, True), ("rtk", 2.0, False), ("gps", 5.0, False)])
 def test_a_base_in_the_wrong_place_is_told_where_positions_are_accurate(
-    tmp_path: Path, kind: str, metres: float, told: bool
+    tmp_path: Path, kind: str, metres: float, reported: bool
 ) -> None:
     said = contradictions(tmp_path, lambda place: (place[0] + metres, place[1], place[2]), kind=kind)
-    assert ("lies 5 m horizontally off" in said and "base station" in said) if told else said == ""
+    assert ("lies 5 m horizontally off" in said and "base station" in said) if reported else said == ""
 
 
 def test_heights_of_no_datum_are_told_but_not_against_heights_above_takeoff(tmp_path: Path) -> None:

@@ -203,12 +203,12 @@ def test_swapped_file_in_a_datum_apart_is_told_of_its_place() -> None:
 def test_heights_a_pole_above_accurate_positions_are_reported_and_a_geoid_is_named_as_possible(
     tmp_path: Path, lift: float, pole: bool, geoid: bool
 ) -> None:
-    told = georef(tmp_path, lift)
-    assert any("Was a pole of that length" in text for text in told.warnings) == pole
-    assert any("possibly one is above the geoid" in text for text in told.notes) == geoid
+    result = georef(tmp_path, lift)
+    assert any("Was a pole of that length" in text for text in result.warnings) == pole
+    assert any("possibly one is above the geoid" in text for text in result.notes) == geoid
 
 
-@pytest.mark.parametrize(("crs", "told"), [("EPSG:5513", True), ("EPSG:5514", False)])
-def test_crs_that_counts_west_is_told_to_be_unsuitable_for_rasters(tmp_path: Path, crs: str, told: bool) -> None:
+@pytest.mark.parametrize(("crs", "warned"), [("EPSG:5513", True), ("EPSG:5514", False)])
+def test_crs_that_counts_west_is_told_to_be_unsuitable_for_rasters(tmp_path: Path, crs: str, warned: bool) -> None:
     done = georef(tmp_path, crs=crs, approximate_crs=True)
-    assert any(f"{crs} " in text and "EPSG:32633" in text for text in done.warnings) == told
+    assert any(f"{crs} " in text and "EPSG:32633" in text for text in done.warnings) == warned

@@ -21,7 +21,7 @@ from splatpipe.pipeline.app.report.facts.wording import two_digits
 from splatpipe.pipeline.app.report.page import TEMPLATES
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.survey.adjustment.adjusted_positions import height_sentence
-from splatpipe.pipeline.survey.adjustment.block_accuracy import CONTROL_SIGMAS_M, MARK_SIGMA_PX, OTHER_HEIGHT
+from splatpipe.pipeline.survey.adjustment.block_accuracy import CONTROL_SIGMAS_M, CROSS_STRIP_RISE, MARK_SIGMA_PX
 from splatpipe.pipeline.survey.adjustment.position_adjustment import ALL, ALL_FISHEYE
 from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95, metres_in_words
 
@@ -134,7 +134,7 @@ def test_what_the_page_says_of_the_remedies_is_what_was_computed() -> None:
     text = page(made_up(), drawn=False)
     across, _, height = (100.0 * sigma for sigma in CONTROL_SIGMAS_M)
     assert f"surveyed to {across:g} cm, and {height:g} cm in height" in text
-    assert (MARK_SIGMA_PX, OTHER_HEIGHT) == (0.5, 0.25) and "half a pixel" in text and "a quarter higher" in text
+    assert (MARK_SIGMA_PX, CROSS_STRIP_RISE) == (0.5, 0.25) and "half a pixel" in text and "a quarter higher" in text
     assert round(NORMAL_95, 2) == adjustment.NORMAL_95
     for value in (0.00512, 0.0349, 0.0994, 0.0996, 0.445, 3.26, 99.0, 1234.0):
         assert two_digits(value) == metres_in_words(value)

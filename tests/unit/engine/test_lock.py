@@ -228,7 +228,7 @@ def test_a_shard_yields_to_a_run_elsewhere_that_signs_simultaneously(
     with pytest.raises(UsageError, match=r"node7.* is working in"), locked_shard(out, "train.1"):
         pass
     assert (out / "stages" / f"{LOCK_FILE}.train.1").read_bytes() == b""
-    with locked_shard(out, "train.1"):  # the same one again, long silent: it died
+    with locked_shard(out, "train.1"):  # its owner has been silent for long: it died
         pass
 
 

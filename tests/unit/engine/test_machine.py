@@ -142,6 +142,6 @@ def test_as_many_threads_are_taken_as_fit_and_at_least_one(tmp_path: Path) -> No
     root = tree(tmp_path, {"proc/self/status": f"VmHWM: 7 kB\nVmRSS: {1 << 20} kB\n"})
     assert resident_bytes(root) == GIB and memory_limit_bytes(0, root) == 16 * GIB
     assert memory_limit_bytes(5 * GIB, root) == 5 * GIB and memory_limit_bytes(20 * GIB, root) == 16 * GIB
-    assert [threads_within(8, each * GIB, 0, root) for each in (1, 3, 11)] == [8, 3, 1]  # of ten that are free
+    assert [threads_within(8, each * GIB, 0, root) for each in (1, 3, 11)] == [8, 3, 1]  # 10 GiB are free
     assert [threads_within(8, GIB, limit * GIB, root) for limit in (1, 3, 99)] == [1, 2, 8]  # one is taken already
     assert threads_within(3, GIB, 0, tmp_path / "unknown") == 3

@@ -214,7 +214,7 @@ def test_broken_frame_is_refused(tmp_path: Path, change: dict[str, object]) -> N
         load_frame(path)
 
 
-def look(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
+def looking_along(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Rotation from the world to a camera that looks along ``forward`` with its top towards ``up``."""
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, up)
@@ -223,7 +223,7 @@ def look(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 GROUND = np.random.default_rng(4).uniform(-30, 30, (400, 3)) * [1.0, 1.0, 0.001]
-TURN = rotation_from_vector(np.array([0.9, -0.4, 1.3]))  # of the model against the world
+TURN = rotation_from_vector(np.array([0.9, -0.4, 1.3]))  # rotation of the model against the world
 
 
 def estimate(
@@ -242,7 +242,9 @@ def test_up_of_an_orbit_whatever_its_pitch_and_however_stored(pitch_deg: float, 
     angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
     outwards = np.stack([np.cos(angles), np.sin(angles), np.zeros(20)], axis=1)
     pitch = np.radians(pitch_deg)
-    cameras = [look(-out * np.cos(pitch) + np.array([0, 0, np.sin(pitch)]), np.array([0, 0, 1.0])) for out in outwards]
+    cameras = [
+        looking_along(-out * np.cos(pitch) + np.array([0, 0, np.sin(pitch)]), np.array([0, 0, 1.0])) for out in outwards
+    ]
     assert estimate(cameras, outwards * 20.0, orientation=orientation) < 1.0
 
 
@@ -252,27 +254,27 @@ def test_up_of_nadir_strips_flown_back_and_forth_or_with_constant_heading() -> N
     centres = np.concatenate([grid, np.full((len(grid), 1), 40.0)], axis=1)
     down = np.array([0.0, 0.0, -1.0]) + rng.normal(size=(len(grid), 3)) * 0.01
     north, flown = np.array([0.0, 1.0, 0.0]), [1.0 if row % 24.0 == 0.0 else -1.0 for row in grid[:, 1]]
-    assert estimate([look(d, north) for d in down], centres) < 1.5
-    assert estimate([look(d, north * sign) for d, sign in zip(down, flown, strict=True)], centres) < 1.5
+    assert estimate([looking_along(d, north) for d in down], centres) < 1.5
+    assert estimate([looking_along(d, north * sign) for d, sign in zip(down, flown, strict=True)], centres) < 1.5
 
 
 def test_up_of_a_walk_along_a_street_is_that_of_the_photos() -> None:
     rng = np.random.default_rng(5)
     centres = np.stack([np.linspace(0.0, 40.0, 30), rng.normal(scale=0.3, size=30), rng.normal(1.6, 0.3, 30)], axis=1)
     ahead = np.array([1.0, 0.0, 0.0]) + rng.normal(size=(30, 3)) * 0.05
-    assert estimate([look(forward, np.array([0.0, 0.0, 1.0])) for forward in ahead], centres) < 3.0
+    assert estimate([looking_along(forward, np.array([0.0, 0.0, 1.0])) for forward in ahead], centres) < 3.0
 
 
 def test_up_below_a_swaying_kite_is_normal_to_the_ground() -> None:
     rng = np.random.default_rng(1)
     centres = np.stack([rng.uniform(-20, 20, 30), rng.uniform(-20, 20, 30), rng.uniform(45, 55, 30)], axis=1)
     tilt = np.array([0.3, 0.0, -1.0]) + rng.normal(size=(30, 3)) * 0.15
-    assert estimate([look(d, np.array([0.0, 1.0, 0.0])) for d in tilt], centres) < 1.0
+    assert estimate([looking_along(d, np.array([0.0, 1.0, 0.0])) for d in tilt], centres) < 1.0
 
 
 def test_photos_along_a_facade_are_not_taken_for_a_survey() -> None:
     centres = np.stack([np.linspace(-15, 15, 12), np.full(12, -20.0), np.full(12, 1.7)], axis=1)
-    cameras = [look(np.array([0.01 * i, 1.0, 0.1]), np.array([0.0, 0.0, 1.0])) for i in range(12)]
+    cameras = [looking_along(np.array([0.01 * i, 1.0, 0.1]), np.array([0.0, 0.0, 1.0])) for i in range(12)]
     assert estimate(cameras, centres) < 8.0  # all tilted up by 6°, and nothing reveals it
 
 

@@ -11,7 +11,7 @@ from splatpipe.pipeline.raster.rasterizer import set_threads
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes, laid_over_nodes_reference
 from splatpipe.pipeline.splat.sky.panorama import STEP_PX, nodes_along
 
-PICTURE_ATOL = 1e-6  # of colours up to 2 in float32
+PICTURE_ATOL = 1e-6  # colours are at most 2, in float32
 GRADIENT_RTOL = 2e-6  # L2; a node's is a sum over up to 15 x 15 pixels
 BACKGROUND = (0.2, 0.5, 0.1)
 # One pixel; a last node at the last pixel, one outside; a row, a column; vectors' ends; more columns than a tile.

@@ -20,11 +20,11 @@ from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 # Tolerances of float32 against float64.
 COLOUR = 1e-5  # sums of up to 60 rounded terms of size 1
-DEPTH = 1e-4  # the same, of depths up to 10
-SQUARES = ("depth_square_sum", 10.0 * DEPTH)  # of depths up to ten from the origin
+DEPTH = 1e-4  # sums of as many rounded depths of up to 10
+SQUARES = ("depth_square_sum", 10.0 * DEPTH)  # depths are at most ten from the origin
 
 GRADIENT = 3e-5  # L2 over all Gaussians, relative: sums over a hundred pixels, through divisions by 1 - alpha
-THIN_GRADIENT = 1e-3  # the same where the covariance's eigenvalues are 10^6 apart, 3e-7 · √10^6 relative
+THIN_GRADIENT = 1e-3  # limit where the covariance's eigenvalues are 10^6 apart, 3e-7 · √10^6 relative
 NO_GRADIENT = 1e-6  # anything smaller is rounding, or from a Gaussian far below a pixel
 FLIPPED = 4  # pixels in which one rounding decides whether a Gaussian at a threshold (1/255, 1e-4) counts
 FLIP = 1e-3  # how much larger than a rounding such a pixel's difference is

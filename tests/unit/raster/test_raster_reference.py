@@ -17,7 +17,7 @@ from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 
 EXACT = 1e-12  # float64 rounding of a few operations
-STEP = 1e-6  # of the finite differences: h² and 1e-16 / h are both small
+STEP = 1e-6  # step of the finite differences: h² and 1e-16 / h are both small
 FINITE_DIFFERENCE = 2e-6  # relative to the largest entry of the gradient
 
 
@@ -184,7 +184,7 @@ def test_gradients_agree_with_finite_differences(sh_degree: int, antialias: bool
     assert all(gradient.abs().max() > 0.01 for gradient in gradients)
     for (name, tensor), gradient in zip(tensors.items(), gradients, strict=True):
         flat, expected = tensor.detach().view(-1), torch.zeros(tensor.numel(), dtype=torch.float64)
-        every = 1 if name != "sh" else max(1, tensor.numel() // 60)  # of the SH, some 60 of all bands and colours
+        every = 1 if name != "sh" else max(1, tensor.numel() // 60)  # 60 of the SH, from all bands
         picked = range(0, tensor.numel(), every)
         with torch.no_grad():
             for i in picked:

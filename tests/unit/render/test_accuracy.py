@@ -25,7 +25,7 @@ from splatpipe.pipeline.survey.crs.frames import Frame, save_frame
 from splatpipe.pipeline.survey.crs.geodesy import Origin
 from splatpipe.stages import evaluate
 
-TURN = rotation_from_vector(np.array([0.25, -0.2, 0.1]))  # of the wall, in the model's frame: seen at a slant
+TURN = rotation_from_vector(np.array([0.25, -0.2, 0.1]))  # rotation of the wall in the model's frame: seen at a slant
 WORLD_FROM_MODEL = Similarity(12.5, rotation_from_vector(np.array([1.1, 0.3, -0.7])), np.array([310.0, -85.0, 22.0]))
 RENDERED = 6e-3  # metres; a pixel is 0.089. The screen filter makes slanted surfaces appear a little nearer
 
@@ -269,14 +269,14 @@ def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixt
     point = {"name": "P[1]", "role": "check", "residual_m": [0.012, -0.034, 0.056], "observations": [seen, wrong]}
     left = {"name": "P2", "role": "left_out", "why": "one mark", "residual_m": None, "observations": []}
     show_accuracy(report, [point, left])
-    shown = capsys.readouterr().err
-    assert "GSD 0.0312 m" in shown and "photo positions" not in shown and "P2: one mark." in shown
-    row = next(line for line in shown.splitlines() if line.startswith("check points"))
+    output = capsys.readouterr().err
+    assert "GSD 0.0312 m" in output and "photo positions" not in output and "P2: one mark." in output
+    row = next(line for line in output.splitlines() if line.startswith("check points"))
     assert row.split()[2:6] == ["2", "0.011", "0.028", "0.056"]
-    row = next(line for line in shown.splitlines() if line.startswith("P[1]"))
+    row = next(line for line in output.splitlines() if line.startswith("P[1]"))
     assert row.split() == ["P[1]", "check", "1", "0.012", "-0.034", "0.056", "5.00", "–", "–", "–"]
-    assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80
-    assert "Positions of" not in shown
+    assert max(len(line.rstrip()) for line in output.splitlines()) <= 80
+    assert "Positions of" not in output
     flights = [{"flight": 0, "offset_m": [0.001, 0.0, -47.002]}, {"flight": 1, "offset_m": [0.001, 0.0, 0.002]}]
     show_accuracy({"tables": {"gps": {**check, "flights": flights}}}, [])
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Positions of")]

@@ -79,7 +79,7 @@ def test_only_as_many_views_as_asked_are_judged_and_their_figures_are_the_same(
     few, every = (json.loads((folder / "metrics.json").read_text()) for folder in (tmp_path, left))
     assert (few["test_views"], few["held_out_views"]) == (2, 3) == (summary["test_views"], summary["held_out_views"])
     assert every["held_out_views"] == 3
-    assert few["per_view"] == [every["per_view"][0], every["per_view"][2]]  # of three
+    assert few["per_view"] == [every["per_view"][0], every["per_view"][2]]  # the second is not judged
     assert few["floaters"]["veil"]["photos"] == 2 and len(list((tmp_path / "views").glob("*.render.png"))) == 2
 
 
@@ -105,18 +105,18 @@ def test_floaters_are_measured_with_or_without_held_out_views(left: Path, inputs
 def test_figures_can_be_recomputed_from_the_pngs(left: Path) -> None:
     for view in json.loads((left / "metrics.json").read_text())["per_view"]:
         photo, render = (read(left / "views" / f"{view['file']}.{kind}.png") for kind in ("photo", "render"))
-        counted = np.ones(photo.shape[:2], bool)
+        valid = np.ones(photo.shape[:2], bool)
         if view["name"] == MASKED:
-            counted = read(left / "views" / f"{view['file']}.mask.png") > 0
-            assert counted.mean() == pytest.approx(0.5) == pytest.approx(view["counted"])
+            valid = read(left / "views" / f"{view['file']}.mask.png") > 0
+            assert valid.mean() == pytest.approx(0.5) == pytest.approx(view["counted"])
         else:
             assert not (left / "views" / f"{view['file']}.mask.png").exists()
-        error = (photo.astype(float) - render.astype(float))[counted] / 255.0
+        error = (photo.astype(float) - render.astype(float))[valid] / 255.0
         assert view["psnr"] == pytest.approx(-10.0 * math.log10((error**2).mean()), abs=1e-4)
-        render = np.where(counted[..., None], render, photo)
+        render = np.where(valid[..., None], render, photo)
         pair = [torch.from_numpy(picture / 255.0).permute(2, 0, 1)[None] for picture in (render, photo)]
         similarity = kornia.metrics.ssim(*pair, window_size=11)[0].mean(dim=0).numpy()
-        assert view["ssim"] == pytest.approx(similarity[counted].mean(), abs=1e-4)
+        assert view["ssim"] == pytest.approx(similarity[valid].mean(), abs=1e-4)
 
 
 def test_photos_are_kept_as_they_are(left: Path, inputs: Inputs) -> None:

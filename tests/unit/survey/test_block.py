@@ -84,7 +84,7 @@ def test_scale_bars_scale_a_block_whose_positions_are_poor() -> None:
 
     def error(block: Block) -> float:
         done = adjust_block(block, observed)
-        assert done.settled
+        assert done.converged
         found, true = (each.points[::7] - each.points.mean(axis=0) for each in (done.block, poor.truth))
         return float(abs(np.linalg.norm(found) / np.linalg.norm(true) - 1.0))
 
@@ -98,7 +98,7 @@ def test_exact_observations_give_the_true_block() -> None:
     noise = as_stated(exact.positions)
     sure = replace(exact.start, sigmas=np.full_like(exact.start.sigmas, 1e-3))
     done = adjust_block(sure, noise.observations(exact.positions))
-    assert done.settled
+    assert done.converged
     assert np.abs(ground_errors(done.block, exact)).max() < 0.02
     assert np.abs(done.block.centres - exact.truth.centres).max() < 1e-3
     assert np.abs(image_errors(done.block)).max() < 0.01

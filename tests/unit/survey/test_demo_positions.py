@@ -27,7 +27,7 @@ ORIGIN = Origin(**TRUTH["frame"]["origin"])
 POSES = {each["name"]: np.array(each["cam_from_world"])[:3] for each in TRUTH["photos"]}
 NAMES = sorted(POSES)
 CENTRES = np.array([-POSES[name][:, :3].T @ POSES[name][:, 3] for name in NAMES])
-CAMERA_NOISE_M = 0.005  # of SfM's cameras
+CAMERA_NOISE_M = 0.005  # sigma of SfM's cameras
 
 
 @pytest.fixture(scope="module")

@@ -170,8 +170,8 @@ def test_a_copied_coordinate_is_told() -> None:
     assert "one and the same longitude" in place(site, site.photos(copied)).issues["position-copied"]
 
 
-@pytest.mark.parametrize(("factor", "told"), [(157.0, True), (40.0, False)])
-def test_control_that_has_not_the_shape_of_the_model_is_told(factor: float, told: bool) -> None:
+@pytest.mark.parametrize(("factor", "reported"), [(157.0, True), (40.0, False)])
+def test_control_that_has_not_the_shape_of_the_model_is_told(factor: float, reported: bool) -> None:
     placed = place(orbit()).placed
     assert placed is not None
     points = [SimpleNamespace(role="control", surveyed=SimpleNamespace(z=1.0)) for _ in range(6)]
@@ -186,6 +186,6 @@ def test_control_that_has_not_the_shape_of_the_model_is_told(factor: float, told
     found = [each.text for each in _agreement(bent)]
     assert found == (
         ["The control points of gcp_list.txt agree with the photos to 3.1 m only, 15% of the width of their area."]
-        if told
+        if reported
         else []
     )

@@ -23,7 +23,7 @@ def test_it_agrees_with_proj_to_a_millimetre_all_over_the_scene(crs: str, half_m
     off *= metres
     assert off.max() < NEAR_ENOUGH_M
     assert made.geographic == (crs == "EPSG:4326")
-    assert (made.largest_error * metres).max() < 30.0 * NEAR_ENOUGH_M  # of twice the scene, up and down as well
+    assert (made.largest_error * metres).max() < 30.0 * NEAR_ENOUGH_M  # over twice the scene, up and down as well
 
 
 def test_its_facts_are_plain_numbers_that_give_the_same_coordinates() -> None:

@@ -38,7 +38,7 @@ def test_quadrants_from_12_px_are_found_to_a_tenth_of_a_pixel() -> None:
             if np.hypot(*near) < 1.0:
                 found += 1
                 errors.append(near)
-    assert found >= 22  # of 24
+    assert found >= 22  # 24 were drawn
     assert np.sqrt(np.square(errors).mean()) < 0.1
 
 
@@ -53,7 +53,7 @@ def test_coded_targets_from_20_px_are_read_and_found() -> None:
     drawn, placed = render(demo_photo(3), kinds, TargetAppearance((20.0, 40.0)), rng, 110.0)
     finds = {f"{f.dictionary}:{f.number}": f for f in find_coded_targets(drawn)}
     read = [target for target in placed if target.name in finds]
-    assert len(finds) == len(read) >= 8  # of 9
+    assert len(finds) == len(read) >= 8  # 9 were drawn
     off = [(finds[t.name].x - t.centre[0], finds[t.name].y - t.centre[1]) for t in read]
     assert np.sqrt(np.square(off).mean()) < 0.3
 

@@ -39,9 +39,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunSplat:
     dataset = tiny_scene.write_dataset(tmp_path_factory.mktemp("run") / "dataset")
     cameras = [view.camera for view in load_views(dataset)]
     scene = Scene(in_world(tiny_scene.true_model(), FRAME), facts_of(FRAME, antialias=False))
-    shown = viewer_scene(dataset, FRAME, viewer_rendering(RenderOptions(sh_degree=3), None))
+    viewer = viewer_scene(dataset, FRAME, viewer_rendering(RenderOptions(sh_degree=3), None))
     return RunSplat(
-        scene, FRAME, dataset, cameras, load_points(dataset), frozenset({cameras[0].name}), {"format": 1}, shown
+        scene, FRAME, dataset, cameras, load_points(dataset), frozenset({cameras[0].name}), {"format": 1}, viewer
     )
 
 

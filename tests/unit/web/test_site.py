@@ -36,8 +36,8 @@ def root(model: Gaussians) -> LevelNode:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> ViewerScene:
     dataset = tiny_scene.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset")
     frame = Frame("arbitrary", Similarity(1.0, UP_FROM_DOWN, np.zeros(3)))
-    look = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01)
-    return viewer_scene(dataset, frame, look, (), COUNT, "Tiny </title> site")
+    rendering = ViewerRendering(antialias=False, background=(0.0, 0.0, 0.0), near=0.01)
+    return viewer_scene(dataset, frame, rendering, (), COUNT, "Tiny </title> site")
 
 
 @pytest.fixture(scope="module")
