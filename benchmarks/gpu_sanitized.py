@@ -133,7 +133,7 @@ def forget_frames(kernels: cuda.CudaKernels, count: int, view: Camera, foreseen:
     """Set the forecast to a new one, or to one that expects a single pair, so that most of a frame is unforeseen."""
     kernels.forecast = Forecast(count)
     if not foreseen:
-        kernels.forecast.learn(FrameFacts(FrameSize(count, tiles_of(view)), count, 1, 1))
+        kernels.forecast.update(FrameFacts(FrameSize(count, tiles_of(view)), count, 1, 1))
 
 
 def train_step(model: Gaussians, view: Camera, depth: bool) -> None:

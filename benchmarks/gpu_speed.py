@@ -270,7 +270,7 @@ def many_pairs(count: int = COVERING, size: tuple[int, int] = FOUR_K) -> Iterato
         kernels = cuda.kernels_of(where)
         assert kernels is not None
         most = kernels.forecast.most_pairs  # as after some training, which foresees the view
-        kernels.forecast.learn(FrameFacts(FrameSize(count, tiles), most, pairs, -(-pairs // most)))
+        kernels.forecast.update(FrameFacts(FrameSize(count, tiles), most, pairs, -(-pairs // most)))
         forget_peak(where)
         took = event_times(lambda: rasterizer.render(model, camera, options), 3, where)
         got = rasterizer.render(model, camera, options).colour

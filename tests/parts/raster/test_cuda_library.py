@@ -137,9 +137,9 @@ def test_each_reason_is_reported_with_what_to_do(installed, reason, hint):
 def test_finding_the_reason_imports_no_torch_without_a_device():
     code = """
 import sys
-from splatpipe.pipeline.raster import cuda_library
+from splatpipe.pipeline.raster.cuda import cuda_library
 assert "torch" not in sys.modules
-found = cuda_library.why_not()
+found = cuda_library.unavailable_reason()
 assert "torch" not in sys.modules or cuda_library.driver() != (0, 0)
 print(found)
 """
@@ -183,8 +183,8 @@ def test_the_systems_state_leads_to_the_reason(fake_driver, version, init, has_k
     library = build_on_cpu() if has_kernels else fake_driver / "libsplat_cuda.so"
     code = f"""
 from pathlib import Path
-from splatpipe.pipeline.raster.cuda.cuda_library import why_not
-print(why_not(Path({str(library)!r})).reason)
+from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
+print(unavailable_reason(Path({str(library)!r})).reason)
 """
     environment = os.environ | {
         "LD_LIBRARY_PATH": str(fake_driver),

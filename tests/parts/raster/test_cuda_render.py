@@ -102,11 +102,11 @@ def test_forecast_keeps_the_recent_maximum_and_forgets_it():
     forecast, size = Forecast(), FrameSize(1000, 400)
     assert forecast.room(size).passes == FIRST_PASSES
     for pairs in (5000, 9000, 4000):
-        forecast.learn(facts(pairs))
+        forecast.update(facts(pairs))
     assert 9000 < forecast.room(size).capacity < 1.5 * 9000
     assert forecast.room(size).passes == 1
     for _ in range(2 * WINDOW):
-        forecast.learn(facts(4000))
+        forecast.update(facts(4000))
     assert 4000 < forecast.room(size).capacity < 1.5 * 4000
 
 
@@ -117,7 +117,7 @@ def test_a_larger_device_holds_more_pairs_at_a_time_within_limits() -> None:
 
 def test_forecast_grows_with_the_model_and_the_picture_and_keeps_to_its_limit():
     forecast = Forecast(most_pairs=20_000)
-    forecast.learn(facts(8000))
+    forecast.update(facts(8000))
     assert forecast.room(FrameSize(1500, 400)).capacity > 1.5 * 8000
     larger = forecast.room(FrameSize(1000, 4000))
     assert larger.capacity == 20_000

@@ -433,7 +433,7 @@ import tiny_scene
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.stages import train
-from splatpipe.pipeline.train import plan
+from splatpipe.pipeline.train.plan import plan
 from splatpipe.pipeline.train.planning.measure import middle_of
 from splatpipe.pipeline.train.plan.lengths import PART_VISITS, WHOLE_VISITS, lengths_of
 from splatpipe.pipeline.train.plan.limits import FIXED_BYTES
