@@ -124,7 +124,7 @@ def follow(dataset: Path, config: LineConfig, arguments: argparse.Namespace) -> 
                 ended = state.history.sizes_ended
                 if state.iteration in ended[-1:]:
                     plan = whole.after(ended)
-                    photos.go_on(order_of(state.history), state.iteration + 1)
+                    photos.switch_order(order_of(state.history), state.iteration + 1)
                 last = state.iteration == ends_at(plan, state.history.flat_at)
                 if clocks.cpu_now() < due and not last:
                     continue
