@@ -18,7 +18,7 @@ PLACES = PathLabels.of(
 
 
 @pytest.mark.parametrize(
-    ("said", "shown"),
+    ("said", "expected"),
     [
         (f"Cannot write to {OUT}: No space left on device.", "Cannot write to OUT: No space left on device."),
         (f"The log: {OUT}/splatpipe.log", "The log: OUT/splatpipe.log"),

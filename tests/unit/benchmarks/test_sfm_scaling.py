@@ -22,7 +22,7 @@ def flight() -> scene.SyntheticFlight:
 def test_a_flight_has_the_requested_observations_and_noise(flight: scene.SyntheticFlight) -> None:
     per_photo = np.bincount(flight.photo)
     assert per_photo.min() > 1000 and per_photo.mean() > 1500
-    assert np.bincount(flight.point).max() == scene.LONGEST_TRACK
+    assert np.bincount(flight.point).max() == scene.MAX_TRACK
     errors = []
     for number in range(COUNT):
         rows = flight.rows(number)
