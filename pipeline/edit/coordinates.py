@@ -16,7 +16,7 @@ from splatpipe.pipeline.survey.crs.world import World, open_world
 
 MAX_COORDINATE = 1e9  # largest magnitude of a coordinate, metres or degrees: no place on the earth has a larger one
 OWN, LOCAL = "own", "local"
-LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
+MAX_QUOTED_CHARACTERS = 60  # characters of what a user wrote, in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,9 @@ def parse_numbers(text: str, option: str, counts: Sequence[int], form: str) -> t
     """
     numbers = [_number(part) for part in text.split(",")[: max(counts) + 1]]
     if len(numbers) not in counts or not all(abs(number) <= MAX_COORDINATE for number in numbers):
-        raise UsageError(f'Cannot understand {option} "{text[:LONGEST_SHOWN]}".', hint=f"Write it as {option} {form}.")
+        raise UsageError(
+            f'Cannot understand {option} "{text[:MAX_QUOTED_CHARACTERS]}".', hint=f"Write it as {option} {form}."
+        )
     return tuple(numbers)
 
 

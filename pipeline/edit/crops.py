@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.edit.coordinates import Coordinates, parse_numbers
-from splatpipe.pipeline.edit.workpiece import MIDDLE, Workpiece
+from splatpipe.pipeline.edit.workpiece import MIDDLE_QUANTILES, Workpiece
 from splatpipe.pipeline.engine.digests import file_digest
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
@@ -200,7 +200,7 @@ def _crop(piece: Workpiece, within: Inside, inside: bool, nothing: Callable[[], 
 
 def _nothing(what: str, piece: Workpiece, coordinates: Coordinates) -> SplatpipeError:
     """The error that nothing is left; it says where the splat is."""
-    ends = np.quantile(coordinates.stated(piece.sample()), MIDDLE, axis=0)
+    ends = np.quantile(coordinates.stated(piece.sample()), MIDDLE_QUANTILES, axis=0)
     low, high = (",".join(f"{number:.{_digits(coordinates)}f}" for number in end) for end in ends)
     named = {"own": "in its own coordinates", "local": "in metres from its origin"}
     where = named.get(coordinates.name, f"in {coordinates.name}")

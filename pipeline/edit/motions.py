@@ -22,7 +22,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vec
 from splatpipe.pipeline.survey.crs.frames import Origin
 
 MAX_DEGREES = 36_000.0  # a hundred turns
-FACTORS = (1e-6, 1e6)  # from micrometres to metres and back
+SCALE_BOUNDS = (1e-6, 1e6)  # from micrometres to metres and back
 AXES = {"up": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 POINT_FORM = "X,Y,Z"
 Point = tuple[float, ...]
@@ -215,9 +215,10 @@ class ScaleBy:
             UsageError: if it is not a number or out of range.
         """
         factor = parse_numbers(text, option, (1,), "FACTOR")[0]
-        if not FACTORS[0] <= factor <= FACTORS[1]:
+        if not SCALE_BOUNDS[0] <= factor <= SCALE_BOUNDS[1]:
             raise UsageError(
-                f"Cannot scale by {text[:60]}.", hint=f"The factor must be between {FACTORS[0]:g} and {FACTORS[1]:g}."
+                f"Cannot scale by {text[:60]}.",
+                hint=f"The factor must be between {SCALE_BOUNDS[0]:g} and {SCALE_BOUNDS[1]:g}.",
             )
         return ScaleBy(factor, pivot)
 
@@ -269,7 +270,7 @@ class ScaleFrom:
         first, second = coordinates.in_frame(np.array([self.first, self.second]))
         distance = float(np.linalg.norm(second - first))
         factor = self.length_m / distance if distance > 0.0 else math.inf
-        if not FACTORS[0] <= factor <= FACTORS[1]:
+        if not SCALE_BOUNDS[0] <= factor <= SCALE_BOUNDS[1]:
             raise SplatpipeError(
                 f"The points of --scale-from are {distance:g} apart in the splat, for {self.length_m:g} m.",
                 hint="Take both points' coordinates from the splat, at the ends of the measured length.",

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from splatpipe.pipeline.edit.workpiece import MIDDLE
+from splatpipe.pipeline.edit.workpiece import MIDDLE_QUANTILES
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.images import Pixels
@@ -22,10 +22,10 @@ from splatpipe.pipeline.splat.model.scene import Scene, turn_of
 WIDTH, HEIGHT = 960, 720  # pixels of one image
 FIELD_DEG = 45.0  # vertical field of view of an oblique view
 ELEVATION_DEG, HEADING_DEG = 35.0, 30.0  # its angle below the horizon, and its heading clockwise from north
-SEEN = 0.3  # least share of a splat's centres within an image for it to count as shown
+MIN_VISIBLE_SHARE = 0.3  # least share of a splat's centres within an image for it to count as shown
 NEARLY_MOST_SHARE = 0.95  # photos that show nearly the most centres; of these, the one with the largest splat is used
-LARGER = 3.0  # times a splat's own size: the most that an image may cover with the splat still recognisable
-NEAR = 0.005  # near plane as a share of the distance to the splat
+MAX_SIZE_RATIO = 3.0  # size of what an image covers over the splat's, at most: the splat is still recognisable
+NEAR_SHARE = 0.005  # near plane as a share of the distance to the splat
 BACKGROUND = (0.82, 0.84, 0.86)  # contrasts with both white walls and dark roofs
 GAP_PX = 8
 LABEL_PX = 28
@@ -51,11 +51,11 @@ def choose_views(cameras: Sequence[Camera], before: Points, after: Float64[np.nd
     """
     photo = _best_photo(cameras, after)
     if photo is not None:
-        first = photo if _share(photo, before) >= SEEN else _best_photo(cameras, before)
+        first = photo if _share(photo, before) >= MIN_VISIBLE_SHARE else _best_photo(cameras, before)
         return PictureCameras(first or oblique_view(_box(before)), photo)
     boxes = [_box(before), _box(after)]
     both = np.array([np.minimum(*[box[0] for box in boxes]), np.maximum(*[box[1] for box in boxes])])
-    if _size(both) <= LARGER * min(_size(box) for box in boxes):
+    if _size(both) <= MAX_SIZE_RATIO * min(_size(box) for box in boxes):
         return PictureCameras(oblique_view(both), oblique_view(both))
     return PictureCameras(oblique_view(boxes[0]), oblique_view(boxes[1]))
 
@@ -64,7 +64,7 @@ def _best_photo(cameras: Sequence[Camera], points: Points) -> Camera | None:
     small = [_reduced(camera) for camera in cameras]
     shares = [_share(camera, points) for camera in small]
     most = max(shares, default=0.0)
-    if most < SEEN:
+    if most < MIN_VISIBLE_SHARE:
         return None
     good = [camera for camera, share in zip(small, shares, strict=True) if share >= NEARLY_MOST_SHARE * most]
     return max(good, key=lambda camera: _spread(camera, points))  # the first one wins ties
@@ -109,7 +109,7 @@ def oblique_view(box: Float64[np.ndarray, "2 3"]) -> Camera:
 
 
 def _box(points: Points) -> Float64[np.ndarray, "2 3"]:
-    return np.asarray(np.quantile(points, MIDDLE, axis=0))
+    return np.asarray(np.quantile(points, MIDDLE_QUANTILES, axis=0))
 
 
 def _size(box: Float64[np.ndarray, "2 3"]) -> float:
@@ -135,7 +135,7 @@ def picture(scene: Scene, camera: Camera, points: Points, label: str) -> Pixels:
         sh_degree=scene.gaussians.sh_degree,
         background=BACKGROUND,
         antialias=scene.facts.antialias,
-        near=max(NEAR * away, 1e-9),
+        near=max(NEAR_SHARE * away, 1e-9),
         depth=False,
     )
     with torch.no_grad():

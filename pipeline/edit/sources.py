@@ -18,8 +18,8 @@ from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.model.scene import Scene
 
 SPLAT, CAMERAS, METRICS, STAGES = "splat.ply", "cameras.json", "metrics.json", "stages"
-LARGEST_CAMERAS = 64 << 20  # bytes: enough for about 100,000 photos
-LARGEST_PICTURE = 65_536  # pixels per side
+MAX_CAMERAS_BYTES = 64 << 20  # bytes: enough for about 100,000 photos
+MAX_PICTURE_SIDE = 65_536  # pixels per side
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def read_cameras(path: Path) -> list[Camera]:
         The valid ones; empty if the file is missing or damaged, in which case images are made without them.
     """
     try:
-        listed = read_json(path, LARGEST_CAMERAS)
+        listed = read_json(path, MAX_CAMERAS_BYTES)
         return [camera for entry in listed if (camera := _camera(entry)) is not None]
     except (OSError, ValueError, TypeError, KeyError):
         return []
@@ -108,7 +108,7 @@ def read_cameras(path: Path) -> list[Camera]:
 def _held_out(path: Path) -> set[str]:
     """Names of a run's held-out photos; empty if its metrics are missing or damaged."""
     try:
-        return {str(view["name"]) for view in read_json(path, LARGEST_CAMERAS)["per_view"]}
+        return {str(view["name"]) for view in read_json(path, MAX_CAMERAS_BYTES)["per_view"]}
     except (OSError, ValueError, TypeError, KeyError):
         return set()
 
@@ -121,7 +121,7 @@ def _camera(entry: dict[str, Any]) -> Camera | None:
     sane = np.isfinite(centre).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     if not (sane and all(math.isfinite(f) and f > 0.0 for f in focal)):
         return None
-    if not (0 < width <= LARGEST_PICTURE and 0 < height <= LARGEST_PICTURE):
+    if not (0 < width <= MAX_PICTURE_SIDE and 0 < height <= MAX_PICTURE_SIDE):
         return None
     pose = np.eye(4)
     pose[:3, :3] = rotation.T

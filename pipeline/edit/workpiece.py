@@ -23,10 +23,10 @@ from splatpipe.pipeline.survey.crs.world import open_world
 
 ROWS = 1 << 18  # Gaussians at a time: their float64 coordinates, in a CRS and intermediate, take 50 MB
 FAR_M = 10_000.0  # at this distance float32 coordinates have steps of a millimetre: the origin is moved nearer
-MIDDLE = (0.01, 0.99)  # quantiles along each axis that bound a splat's main extent, robust against floaters
-COARSEST = 1e-5  # largest float32 step as a share of the splat's size: a millimetre for a site of 100 m
+MIDDLE_QUANTILES = (0.01, 0.99)  # quantiles along each axis that bound a splat's main extent, robust against floaters
+MAX_STEP_SHARE = 1e-5  # largest float32 step as a share of the splat's size: a millimetre for a site of 100 m
 SAMPLE = 200_000  # Gaussians from which a splat's extent is estimated
-FREED = 0.5  # memory is released once fewer than this share of the Gaussians remains
+MIN_KEPT_SHARE = 0.5  # memory is released once fewer than this share of the Gaussians remains
 
 
 class Workpiece:
@@ -69,7 +69,7 @@ class Workpiece:
 
     def middle(self) -> Float64[np.ndarray, " 3"]:
         """Centre, in the frame, of the box that excludes the outermost 1 % at either end of each axis."""
-        low, high = np.quantile(self.sample(), MIDDLE, axis=0)
+        low, high = np.quantile(self.sample(), MIDDLE_QUANTILES, axis=0)
         return np.asarray((low + high) / 2.0)
 
     def _placed(self, means: torch.Tensor) -> Float64[np.ndarray, "n 3"]:
@@ -86,7 +86,7 @@ class Workpiece:
             for tensor in self._gaussians.tensors().values():
                 tensor[count : count + left] = tensor[rows][mask]
             count += left
-        few = count < FREED * len(self)
+        few = count < MIN_KEPT_SHARE * len(self)
         self._gaussians = self._gaussians.first(count)
         if few:
             self._gaussians = self._gaussians.clone()
@@ -132,7 +132,7 @@ class Workpiece:
             SplatpipeError: if float32 would be too coarse.
         """
         sample = self.sample()
-        low, high = np.quantile(sample, MIDDLE, axis=0)
+        low, high = np.quantile(sample, MIDDLE_QUANTILES, axis=0)
         middle = (low + high) / 2.0
         if self.facts.place is not None and float(np.linalg.norm(middle)) > FAR_M:
             self._take_zero(middle)
@@ -142,7 +142,7 @@ class Workpiece:
             sample = self.sample()
         size = float(np.linalg.norm(high - low)) + self._moved.scale * _sigma(self._gaussians)
         before = self._moved.scale * _step(_largest(self._gaussians.means))  # the file was no finer before
-        if not _step(float(np.abs(sample).max())) <= max(COARSEST * size, before):
+        if not _step(float(np.abs(sample).max())) <= max(MAX_STEP_SHARE * size, before):
             raise SplatpipeError(
                 "The splat would be too far from the origin for a file, whose coordinates are 32-bit numbers.",
                 hint="Keep coordinates small; a georeferenced splat can be moved anywhere with --move-to.",

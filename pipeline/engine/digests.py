@@ -19,7 +19,7 @@ from splatpipe.pipeline.engine.stage import JSON
 
 BLOCK_BYTES = 1 << 20
 UNREADABLE = "unreadable"  # the digest of a file that cannot be read; ingest will exclude it and give the reason
-KNOWN = 4  # file attributes by which a cached digest is recognised as current
+CACHED_ATTRIBUTES = 4  # file attributes by which a cached digest is recognised as current
 MAX_SOURCE_FILES = 1_000_000  # a folder with more is somebody's home folder, not a capture
 
 
@@ -120,7 +120,7 @@ class HashTable:
         self._known: dict[str, list[JSON]] = {}
         try:
             table = read_json(path)
-            self._known = {str(key): list(value) for key, value in table.items() if len(value) == KNOWN + 1}
+            self._known = {str(key): list(value) for key, value in table.items() if len(value) == CACHED_ATTRIBUTES + 1}
         except (OSError, ValueError, AttributeError, TypeError):
             pass  # a missing or corrupt table only costs reading the photos again
 
@@ -141,9 +141,9 @@ class HashTable:
                 status = path.stat()
                 wanted[name] = [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
             except OSError:
-                wanted[name] = [-1] * KNOWN
+                wanted[name] = [-1] * CACHED_ATTRIBUTES
             known = self._known.get(str(path))
-            if known is None or known[:KNOWN] != wanted[name]:
+            if known is None or known[:CACHED_ATTRIBUTES] != wanted[name]:
                 unread.append(name)
         with ThreadPoolExecutor(max(1, threads)) as pool:
             for done, (name, sha) in enumerate(
@@ -152,9 +152,9 @@ class HashTable:
                 self._known[str(files[name])] = [*wanted[name], sha]
                 if progress:
                     progress(done, len(unread))
-        found = digest(sorted([name, self._known[str(path)][KNOWN]] for name, path in files.items()))
+        found = digest(sorted([name, self._known[str(path)][CACHED_ATTRIBUTES]] for name, path in files.items()))
         if unread and self._remember:
-            self._known = {path: known for path, known in self._known.items() if known[KNOWN] != UNREADABLE}
+            self._known = {path: known for path, known in self._known.items() if known[CACHED_ATTRIBUTES] != UNREADABLE}
             self._save()
         return found
 

@@ -10,14 +10,14 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-AHEAD = 2  # finished results that may wait for a slower one before them
+MAX_WAITING = 2  # finished results that may wait for a slower one before them
 POLL_S = 0.3
 
 
 def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
     """Apply a function to each item in threads, and yield the results in the items' order.
 
-    Only ``threads + AHEAD`` results exist at a time. If the caller stops or fails, pending items are dropped and
+    Only ``threads + MAX_WAITING`` results exist at a time. If the caller stops or fails, pending items are dropped and
     running ones are not waited for, so that an interrupted stage ends at once.
 
     Args:
@@ -30,7 +30,7 @@ def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threa
     try:
         for item in items:
             waiting.append(pool.submit(function, item))
-            if len(waiting) >= threads + AHEAD:
+            if len(waiting) >= threads + MAX_WAITING:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

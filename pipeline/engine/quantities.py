@@ -7,7 +7,7 @@ import re
 
 from splatpipe.pipeline.engine.errors import UsageError
 
-LONGEST_TEXT = 24  # characters: longer than any quantity that makes sense
+MAX_TEXT_CHARACTERS = 24  # characters: longer than any quantity that makes sense
 
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?"
 _DURATION = re.compile(rf"(?:({_NUMBER})h)?(?:({_NUMBER})m)?(?:({_NUMBER})s)?")
@@ -28,12 +28,12 @@ def parse_duration(text: str, option: str) -> float:
     Raises:
         UsageError: if it is anything else, or zero.
     """
-    match = _DURATION.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
+    match = _DURATION.fullmatch(text.strip()) if len(text) <= MAX_TEXT_CHARACTERS else None
     parts = match.groups(default="0") if match else ()
     seconds = sum(float(part) * unit for part, unit in zip(parts, _SECONDS, strict=False))
     if not 0.0 < seconds < math.inf:
         raise UsageError(
-            f'Cannot understand {option} "{text[:LONGEST_TEXT]}".',
+            f'Cannot understand {option} "{text[:MAX_TEXT_CHARACTERS]}".',
             hint=f"Write it with its units, largest first: {option} 90s, 10m or 1h30m.",
         )
     return seconds
@@ -49,11 +49,11 @@ def parse_bytes(text: str, option: str) -> int:
     Raises:
         UsageError: if it is anything else, or zero.
     """
-    match = _BYTES.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
+    match = _BYTES.fullmatch(text.strip()) if len(text) <= MAX_TEXT_CHARACTERS else None
     number = int(float(match[1]) * _UNITS[match[2]]) if match else 0
     if number <= 0:
         raise UsageError(
-            f'Cannot understand {option} "{text[:LONGEST_TEXT]}".',
+            f'Cannot understand {option} "{text[:MAX_TEXT_CHARACTERS]}".',
             hint=f"Write it with its unit: {option} 512M or 8G.",
         )
     return number
@@ -69,11 +69,11 @@ def parse_length(text: str, option: str) -> float:
     Raises:
         UsageError: if it is anything else, or zero.
     """
-    match = _LENGTH.fullmatch(text.strip()) if len(text) <= LONGEST_TEXT else None
+    match = _LENGTH.fullmatch(text.strip()) if len(text) <= MAX_TEXT_CHARACTERS else None
     metres = float(match[1]) * _METRES[match[2]] if match else 0.0
     if not 0.0 < metres < math.inf:
         raise UsageError(
-            f'Cannot understand {option} "{text[:LONGEST_TEXT]}".',
+            f'Cannot understand {option} "{text[:MAX_TEXT_CHARACTERS]}".',
             hint=f"Write it with its unit: {option} 2cm, 25mm or 0.1m.",
         )
     return round(metres, 9)

@@ -23,9 +23,7 @@ from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
-STEEP_PITCH_RAD = math.radians(
-    -60.0
-)  # steeper than this, a camera has no heading of its own: the horizon is too far away
+STEEP_PITCH_RAD = math.radians(-60.0)  # steeper, a camera has no heading of its own: the horizon is too far away
 MIN_HORIZONTAL_PART = 0.1  # minimum horizontal part of the mean view of nadir cameras to define what is ahead
 MIN_OBLIQUE_SHARE = 0.2  # share of oblique cameras up to which the others do not take their headings
 FINE_STEPS, FINE_STEPS_A_PLACE = 4000, 10  # linear steps of a path, at least, and per position

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
-OPAQUE = 0.5  # minimum opacity of Gaussians that a camera must not fly through
+MIN_SOLID_OPACITY = 0.5  # minimum opacity of Gaussians that a camera must not fly through
 MAX_POINTS = 400_000  # used for distances: more do not help at the scale of metres
-WITNESSES = 8  # minimum number of points that near: a few floaters are not a wall
+MIN_NEAR_POINTS = 8  # minimum number of points that near: a few floaters are not a wall
 
 
 class Clearance:
@@ -25,13 +25,13 @@ class Clearance:
         """
         solid = solid[np.isfinite(solid).all(axis=1)]
         solid = solid[:: max(1, -(-len(solid) // MAX_POINTS))]
-        self._tree = cKDTree(solid) if len(solid) >= WITNESSES else None
+        self._tree = cKDTree(solid) if len(solid) >= MIN_NEAR_POINTS else None
 
     def at(self, places: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, " m"]:
-        """Distance from each place to the `WITNESSES`-th nearest point, world units; infinite if there is none."""
+        """Distance from each place to the ``MIN_NEAR_POINTS``-th nearest point, world units; infinite without one."""
         if self._tree is None or len(places) == 0:
             return np.full(len(places), np.inf)
-        return np.asarray(self._tree.query(places, [WITNESSES])[0][:, 0])
+        return np.asarray(self._tree.query(places, [MIN_NEAR_POINTS])[0][:, 0])
 
     def between(
         self, start: Float64[np.ndarray, " 3"], end: Float64[np.ndarray, " 3"], step: float
@@ -49,5 +49,5 @@ class Clearance:
 
 def solid_places(gaussians: Gaussians) -> Float64[np.ndarray, "n 3"]:
     """Centres of the opaque Gaussians, in the model's frame."""
-    opaque = torch.sigmoid(gaussians.opacity_logits.detach()) >= OPAQUE
+    opaque = torch.sigmoid(gaussians.opacity_logits.detach()) >= MIN_SOLID_OPACITY
     return gaussians.means.detach()[opaque].cpu().numpy().astype(np.float64)

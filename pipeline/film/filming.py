@@ -31,8 +31,8 @@ from splatpipe.pipeline.splat.sky.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_
 
 What = Literal["colour", "depth", "normals"]
 ASPECT = 16.0 / 9.0
-SAMPLED = 8  # cameras of a path that determine the depth range
-RANGE = (0.01, 0.99)  # quantiles of depth between which colours run from near to far
+SAMPLED_CAMERAS = 8  # cameras of a path that determine the depth range
+DEPTH_QUANTILES = (0.01, 0.99)  # quantiles of depth between which colours run from near to far
 MIN_SIDE, MAX_SIDE = 16, 8192  # sides of an image, pixels
 ROWS_AT_ONCE = 256  # rows of an image that are coloured at a time
 
@@ -138,13 +138,13 @@ class FrameRenderer:
 def depth_range(pictures: FrameRenderer, cameras: Sequence[Camera]) -> tuple[float, float]:
     """The range of depths shown by most images of a path, nearest and farthest."""
     found = []
-    for index in np.unique(np.linspace(0, len(cameras) - 1, min(SAMPLED, len(cameras))).round().astype(int)):
+    for index in np.unique(np.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().astype(int)):
         values = pictures.values(reduced_camera(cameras[index], MAX_FILM_MEGAPIXELS))
         if values is not None and (values > 0.0).any():
             found.append(values[values > 0.0])
     if not found:
         return 1.0, 2.0
-    nearest, farthest = np.quantile(np.concatenate(found), RANGE).tolist()
+    nearest, farthest = np.quantile(np.concatenate(found), DEPTH_QUANTILES).tolist()
     return nearest, max(farthest, 1.001 * nearest)
 
 

@@ -50,7 +50,7 @@ KIND = TableKind(
     max_lines=10_001,
 )
 MAX_KEYFRAMES = 10_000
-LONGEST_S = 3600.0
+MAX_DURATION_S = 3600.0
 WIDEST_DEG, NARROWEST_DEG = 150.0, 1.0
 STEEPEST_DEG, MIN_TILT_DEG = 90.0, 89.999  # keeps a heading defined when looking straight down
 FULL_TURNS_DEG = 36_000.0  # largest heading: no path turns more often
@@ -198,8 +198,8 @@ def _keyframes(items: Sequence[tuple[int, Numbers]]) -> Keyframes:
     route = towards(places, places + ahead)
     times, angles = _all_or_none(items, "time"), _all_or_none(items, "fov")
     if times is not None:
-        if not (np.diff(times) > 0.0).all() or times[0] < 0.0 or times[-1] > LONGEST_S:
-            raise LineError(0, f"its times do not rise from 0 to at most {LONGEST_S:.0f} seconds")
+        if not (np.diff(times) > 0.0).all() or times[0] < 0.0 or times[-1] > MAX_DURATION_S:
+            raise LineError(0, f"its times do not rise from 0 to at most {MAX_DURATION_S:.0f} seconds")
         times = times - times[0]
     if angles is not None and not ((angles >= NARROWEST_DEG) & (angles <= WIDEST_DEG)).all():
         raise LineError(0, f"a fov is not between {NARROWEST_DEG:.0f} and {WIDEST_DEG:.0f} degrees")

@@ -12,11 +12,11 @@ from splatpipe.pipeline.film.clearance import Clearance
 from splatpipe.pipeline.film.photo_route import PhotoTrack, followed_photos
 from splatpipe.pipeline.geometry.upright import rotation_to_up
 
-LOOKED_AT = 72  # positions on a circle at which clearance is checked
-CLEAR = 0.25  # minimum clearance from solid parts, as a share of the distance from the centre
+CHECKED_POSITIONS = 72  # positions on a circle at which clearance is checked
+MIN_CLEARANCE = 0.25  # minimum clearance from solid parts, as a share of the distance from the centre
 STEP_DEG = 5.0  # elevation step by which a circle without clearance is raised
-HIGHEST_DEG = 70.0
-WIDER = (1.0, 1.25, 1.5, 2.0)  # times the photos' distance, if no elevation is clear
+MAX_ELEVATION_DEG = 70.0
+RADIUS_FACTORS = (1.0, 1.25, 1.5, 2.0)  # radii over the photos' distance that are tried if no elevation is clear
 OVER_A_MAP_DEG = 50.0  # elevation if all photos are nadir: keeps walls that no photo covers out of view
 MIN_ELEVATION_DEG = 5.0
 
@@ -56,14 +56,14 @@ def orbit(capture: PhotoTrack, frames: int) -> Route:
 def _clear(clearance: Clearance, wanted: tuple[np.ndarray, float, float], upright: np.ndarray) -> tuple[float, float]:
     """Distance and elevation (radians) of the first circle with clearance; of the clearest if none has it."""
     middle, distance, lowest = wanted
-    angles = 2.0 * math.pi * np.arange(LOOKED_AT) / LOOKED_AT
+    angles = 2.0 * math.pi * np.arange(CHECKED_POSITIONS) / CHECKED_POSITIONS
     tried: list[tuple[float, float, float]] = []
-    highest = max(lowest, math.radians(HIGHEST_DEG))
-    for factor in WIDER:
+    highest = max(lowest, math.radians(MAX_ELEVATION_DEG))
+    for factor in RADIUS_FACTORS:
         for elevation in np.arange(lowest, highest + 1e-9, math.radians(STEP_DEG)).tolist():
             circle = _circle(middle, factor * distance, elevation, angles)
             share = float(clearance.at(circle.places @ upright).min()) / (factor * distance)
-            if share >= CLEAR:
+            if share >= MIN_CLEARANCE:
                 return factor * distance, elevation
             tried.append((share, factor * distance, elevation))
     return max(tried)[1:]

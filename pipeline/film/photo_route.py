@@ -23,17 +23,17 @@ SPEED = 0.7  # comfortable speed, path lengths (see ``camera_path``) per second:
 CORNER_S = 1.0  # standard deviation of the Gaussian that rounds corners, seconds at that speed
 CORNER_LEGS = 0.6  # standard deviation of that Gaussian in median distances between photos, if this is longer
 ALONE_LEGS, ALONE_LENGTH = 4.0, 0.5  # a stray's distance to the nearest photo: in median distances, and in lengths
-FEWEST_SEEN = 10  # sparse points; a photo that sees fewer is unreliable
-ODD_DEPTH = 5.0  # times nearer or farther than the others: the ground at take-off, a test shot of the sky
+MIN_VISIBLE_POINTS = 10  # sparse points; a photo that sees fewer is unreliable
+ODD_DEPTH_RATIO = 5.0  # nearer or farther than the others: the ground at take-off, a test shot of the sky
 LONG_LEG = 5.0  # median legs: the flight is interrupted there
 LONGEST_LEG = 2.0  # path lengths; about 80° around a building
 DETOUR_TIMES, DETOUR_LEGS = 3.0, 1.5  # a detour: there and back over the direct leg; each over the median leg
-FEWEST_LEGS = 4  # to detect detours
-LONGER = 1.6  # names give the order unless they make the path longer by this factor
-CLEAR = 0.5  # minimum clearance, as a share of the photos' own distance from solid parts
+MIN_LEGS = 4  # to detect detours
+MAX_LONGER_RATIO = 1.6  # names give the order unless they make the path longer by this factor
+MIN_CLEARANCE = 0.5  # minimum clearance, as a share of the photos' own distance from solid parts
 CLEAR_STEPS = 4.0  # samples per that distance
 MAX_COMPARED = 3000  # photos compared pairwise: tables of 72 MB
-SOFTER = 5  # halvings of the smoothing width, if a rounded corner comes too near
+MAX_HALVINGS = 5  # halvings of the smoothing width, if a rounded corner comes too near
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +102,9 @@ def photo_film(capture: PhotoTrack, frames: int, seconds: float) -> Route:
 def _clear_way(capture: PhotoTrack, route: Route, distance: float, width: float) -> Route:
     """A route smoothed as far as it keeps clear of solid parts."""
     upright = rotation_to_up(capture.up)
-    wanted = CLEAR * float(capture.clearance.at(route.places @ upright).min())
+    wanted = MIN_CLEARANCE * float(capture.clearance.at(route.places @ upright).min())
     way, _ = smoothed(route, distance, width)
-    for _ in range(SOFTER):
+    for _ in range(MAX_HALVINGS):
         if bool((capture.clearance.at(way.places @ upright) >= wanted).all()):
             break
         width *= 0.5
@@ -115,7 +115,7 @@ def _clear_way(capture: PhotoTrack, route: Route, distance: float, width: float)
 def _no_detours(route: Route, distance: float) -> Int64[np.ndarray, " k"]:
     """Indices of all photos except single detours, e.g. a close-up or a shot of something else."""
     legs = route.steps(distance)
-    if len(legs) < FEWEST_LEGS:
+    if len(legs) < MIN_LEGS:
         return np.arange(len(route))
     past = np.array([route[index : index + 3 : 2].steps(distance)[0] for index in range(len(legs) - 1)])
     there, back = legs[:-1], legs[1:]
@@ -126,13 +126,13 @@ def _no_detours(route: Route, distance: float) -> Int64[np.ndarray, " k"]:
 def followed_photos(capture: PhotoTrack) -> tuple[Int64[np.ndarray, " k"], float]:
     """Indices of the photos that are not strays, in name order, and the median distance of what they see."""
     depths = capture.depths()
-    enough = np.array([len(rows) >= FEWEST_SEEN for rows in capture.seen]) & np.isfinite(depths)
+    enough = np.array([len(rows) >= MIN_VISIBLE_POINTS for rows in capture.seen]) & np.isfinite(depths)
     if enough.sum() < 2:
         enough = np.isfinite(depths)
     if not enough.any():
         return np.zeros(0, np.int64), 1.0
     distance = float(np.median(depths[enough]))
-    alike = enough & (depths <= ODD_DEPTH * distance) & (depths >= distance / ODD_DEPTH)
+    alike = enough & (depths <= ODD_DEPTH_RATIO * distance) & (depths >= distance / ODD_DEPTH_RATIO)
     kept = np.flatnonzero(alike)
     if 2 < len(kept) <= MAX_COMPARED:
         route = upright_route([capture.cameras[int(index)] for index in kept], capture.up)
@@ -168,7 +168,7 @@ def _order(route: Route, distance: float) -> Int64[np.ndarray, " n"]:
         legs = np.sort(table[order[:-1], order[1:]])
         return float(legs[: max(1, -(-9 * len(legs) // 10))].sum())
 
-    return other if typical(named) > LONGER * typical(other) else named
+    return other if typical(named) > MAX_LONGER_RATIO * typical(other) else named
 
 
 def _open(
@@ -179,7 +179,7 @@ def _open(
     places = np.array([capture.cameras[int(index)].centre() for index in photos])
     own = capture.clearance.at(places)
     for leg in np.flatnonzero(near):
-        wanted = CLEAR * min(own[leg], own[leg + 1])
+        wanted = MIN_CLEARANCE * min(own[leg], own[leg + 1])
         if np.isfinite(wanted):
             step = max(wanted / CLEAR_STEPS, 1e-9)
             near[leg] = bool((capture.clearance.between(places[leg], places[leg + 1], step) >= wanted).all())

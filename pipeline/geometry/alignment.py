@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.geometry.correspondences import (
     MIN_NOISE_FACTOR,
-    REDUNDANT,
+    MIN_REDUNDANT_POINTS,
     Correspondences,
     DirectionPrior,
     InlierLimit,
@@ -19,7 +19,7 @@ from splatpipe.pipeline.geometry.correspondences import (
     normed,
 )
 from splatpipe.pipeline.geometry.similarity import (
-    FREE,
+    RANK_TOLERANCE,
     SIMILARITY,
     Similarity,
     cross_matrix,
@@ -49,8 +49,8 @@ IRLS_TOLERANCE = 1e-13  # size of a step at which iterations end: radians, and r
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
 OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors are never this large
-LIMIT_STEP = 1.5  # from one limit to the next where the noise has to be estimated
-CRITICAL, CRITICAL_FEW = 4.0, 24.0  # times the noise, by its degrees of freedom: Student's t at about 1 in 10,000
+LIMIT_GROWTH = 1.5  # from one limit to the next where the noise has to be estimated
+CRITICAL_NOISES, CRITICAL_NOISES_FEW = 4.0, 24.0  # times the noise, by freedom: Student's t at about 1 in 10,000
 OUTLIER_SIGMAS = 3.0  # an error within the position's stated accuracy is not an outlier
 MIN_NOISE_RATIO = 1e-9  # least noise as a multiple of the stated sigmas: exact data have no spread to measure
 MAX_GROUPS = 20  # groups whose own triples are tried: one good group is enough
@@ -138,7 +138,7 @@ def offset_step_sigmas(fit: SimilarityFit, points: Correspondences, reference: i
     # An offset is the mean residual of its points, so it moves with the similarity by their mean Jacobian.
     mean = np.einsum("gn,nk,nkp->gkp", membership, weights, problem.jacobian()) / own[:, :, None]
     steps = mean - mean[reference]
-    covariance = np.linalg.pinv(_information(problem, weights, None), rcond=FREE, hermitian=True)
+    covariance = np.linalg.pinv(_information(problem, weights, None), rcond=RANK_TOLERANCE, hermitian=True)
     variances = np.einsum("gkp,pq,gkq->gk", steps, covariance, steps) + 1.0 / own + 1.0 / own[reference]
     return np.asarray(max(fit.noise, MIN_NOISE_FACTOR) * np.sqrt(np.maximum(variances, 0.0)))
 
@@ -196,10 +196,12 @@ def _at_own_noise(points: Correspondences, hypotheses: list[Similarity]) -> tupl
         used = int(fit.inliers.sum())
         degrees = max(1, 3 * used - SIMILARITY)
         spread = math.sqrt(3.0 * float((normed(fit.residuals, points)[fit.inliers] ** 2).sum()) / degrees)
-        is_consistent = 2 * used >= len(points) and limit.most >= (CRITICAL + CRITICAL_FEW / degrees) * spread
+        is_consistent = (
+            2 * used >= len(points) and limit.most >= (CRITICAL_NOISES + CRITICAL_NOISES_FEW / degrees) * spread
+        )
         if is_consistent or used == len(points) or limit.most > widest:
             return fit, limit
-        limit = InlierLimit(LIMIT_STEP * limit.most, of_sigmas=True)
+        limit = InlierLimit(LIMIT_GROWTH * limit.most, of_sigmas=True)
 
 
 def _hypotheses(points: Correspondences) -> list[Similarity]:
@@ -264,7 +266,7 @@ def _refine(
         inliers = near
     chosen = points.only(inliers).at_noise(noise)
     information = _information(_Problem(chosen, similarity), _sigma_weights(chosen), prior)
-    factor = max(noise, MIN_NOISE_FACTOR) if len(chosen) >= REDUNDANT else max(noise, 1.0)
+    factor = max(noise, MIN_NOISE_FACTOR) if len(chosen) >= MIN_REDUNDANT_POINTS else max(noise, 1.0)
     sigma_rotation, _ = _weakest_rotation(information)
     return SimilarityFit(
         similarity=similarity,
@@ -328,14 +330,14 @@ def _weakest_rotation(information: Float64[np.ndarray, "7 7"]) -> tuple[float, F
     left = information[:3, :3] - information[:3, 3:] @ others @ information[3:, :3]
     values, vectors = np.linalg.eigh((left + left.T) / 2.0)
     weakest = float(values[0])
-    return (1.0 / math.sqrt(weakest) if weakest > FREE * values[2] else math.inf), vectors[:, 0]
+    return (1.0 / math.sqrt(weakest) if weakest > RANK_TOLERANCE * values[2] else math.inf), vectors[:, 0]
 
 
 def _sigma_scale(information: Float64[np.ndarray, "7 7"]) -> float:
     rest = [0, 1, 2, 4, 5, 6]
-    others = np.linalg.pinv(information[np.ix_(rest, rest)], rcond=FREE, hermitian=True)
+    others = np.linalg.pinv(information[np.ix_(rest, rest)], rcond=RANK_TOLERANCE, hermitian=True)
     left = float(information[3, 3] - information[3, rest] @ others @ information[rest, 3])
-    return 1.0 / math.sqrt(left) if left > FREE * information[3, 3] else math.inf
+    return 1.0 / math.sqrt(left) if left > RANK_TOLERANCE * information[3, 3] else math.inf
 
 
 def _triples(points: Correspondences) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 MIN_NOISE_FACTOR = 0.3  # GNSS errors drift slowly: residuals of one flight look better than the positions are
-REDUNDANT = 8  # points; from this many on, the residuals give the noise better than the stated sigmas do
+MIN_REDUNDANT_POINTS = 8  # points from which on the residuals give the noise better than the stated sigmas do
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from splatpipe.pipeline.geometry.similarity import Similarity, cross_matrix, rot
 
 MAX_ROUNDS = 50
 STEP_TOLERANCE = 1e-12  # size of a step at which iterations end: radians, and relative to the extent
-FREE = 1e-13  # an eigenvalue below this, relative to the largest, is rounding
+RANK_TOLERANCE = 1e-13  # an eigenvalue below this, relative to the largest, is rounding
 SIMILARITY = 7
-QUIET = 2.5  # times the stated sigmas: control that agrees this well is not searched for blunders
-CRITICAL, CRITICAL_FEW = 4.0, 24.0  # studentised residual of a blunder: a little over Student's t at 1 in 1000
+MAX_QUIET_SIGMAS = 2.5  # residual over the stated sigmas up to which control is not searched for blunders
+CRITICAL_RESIDUAL, CRITICAL_RESIDUAL_FEW = 4.0, 24.0  # studentised, of a blunder: just over Student's t at 1 in 1000
 MAX_PAIRED = 40  # points up to which pairs are tried, too
 MIN_LEFT = 3
 MAX_SUSPECTS = 100  # points tried, those with the largest residuals; a blunder is among them
@@ -158,7 +158,7 @@ def find_blunders(start: Similarity, observed: JointObservations, priors: Priors
     candidates = np.flatnonzero(observed.is_control).tolist()
     while len(candidates) - len(found) > MIN_LEFT and 2 * len(found) < min(len(candidates), 2 * MAX_FOUND):
         kept = _without(len(observed), found)
-        if fit_jointly(start, observed.only(kept), priors).noise <= QUIET:
+        if fit_jointly(start, observed.only(kept), priors).noise <= MAX_QUIET_SIGMAS:
             break
         more = _worst(start, observed, priors, found, least_m)
         if not more:
@@ -187,7 +187,7 @@ def studentised(residual: Float64[np.ndarray, " 3"], sigmas: Float64[np.ndarray,
 
 def critical(degrees: int) -> float:
     """Critical value of a studentised residual, by the degrees of freedom of its standard deviation."""
-    return CRITICAL + CRITICAL_FEW / max(degrees, 1)
+    return CRITICAL_RESIDUAL + CRITICAL_RESIDUAL_FEW / max(degrees, 1)
 
 
 def _worst(
@@ -279,7 +279,8 @@ def _inverse(information: Float64[np.ndarray, "p p"]) -> Float64[np.ndarray, "p 
     """Pseudo-inverse, zero along undetermined directions; unknowns are scaled to equal size first."""
     sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
     return np.asarray(
-        np.linalg.pinv(information / np.outer(sizes, sizes), rcond=FREE, hermitian=True) / np.outer(sizes, sizes)
+        np.linalg.pinv(information / np.outer(sizes, sizes), rcond=RANK_TOLERANCE, hermitian=True)
+        / np.outer(sizes, sizes)
     )
 
 

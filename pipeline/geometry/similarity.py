@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 SIMILARITY = 7  # unknowns of a small change: a rotation vector, the log scale, the position of the points' mean
-FREE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: its direction is not determined
+RANK_TOLERANCE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: nothing determines its axis
 
 
 @dataclass(frozen=True)
@@ -169,4 +169,4 @@ def solve_step(
     """Solve the normal equations; zero along undetermined directions. Unknowns are scaled to equal size first."""
     sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(sizes, sizes)
-    return np.asarray(np.linalg.pinv(scaled, rcond=FREE, hermitian=True) @ (gradient / sizes) / sizes)
+    return np.asarray(np.linalg.pinv(scaled, rcond=RANK_TOLERANCE, hermitian=True) @ (gradient / sizes) / sizes)

@@ -21,18 +21,18 @@ TOP_OF_ORIENTATION = {
     8: (1.0, 0.0),
 }
 UPRIGHT_AND_TURNED = (1, 6)  # EXIF orientations for landscape and portrait
-ALIKE = 0.9  # length of the mean of unit vectors within about 25°
-STEADY = 0.997  # within about 4°: a gimbal, which points down better than the ground is level
-PARALLEL = 0.9995  # within about 2°: nobody holds a camera this steady while walking
-SCATTERED = 0.5  # below this, the vectors mostly cancel
-GRID = 0.3  # least spread of the cameras along the image's height, over that along its width, of a survey
+MIN_ALIKE_LENGTH = 0.9  # least length of the mean of unit vectors within about 25°
+MIN_STEADY_LENGTH = 0.997  # mean within about 4°: a gimbal, which points down better than the ground is level
+MIN_PARALLEL_LENGTH = 0.9995  # mean within about 2°: nobody holds a camera this steady while walking
+MAX_SCATTERED_LENGTH = 0.5  # mean below which the vectors mostly cancel
+MIN_GRID_RATIO = 0.3  # least spread of the cameras along the image's height, over that along its width, of a survey
 MIN_FAN_WIDTH = 0.2  # width of the fan of the cameras' horizontal axes (a sine) that determines their plane
 MAX_FAN_THICKNESS_RATIO = 0.35  # thickness of that fan over its width, below which the axes lie in a plane
 GROUND_POINTS = 5000
 MIN_GROUND_POINTS = 50
 GROUND_SAMPLES = 500
 GROUND_COSINE = math.cos(math.radians(40.0))  # between the ground's normal and the cameras' mean view
-GROUND_THICKNESS = 0.015  # over the cameras' height above it
+GROUND_THICKNESS = 0.015  # distance of the ground's points from their plane, over the cameras' height above it
 MIN_GROUND_SHARE = 0.2  # least share of the points that lie on the ground plane
 ROBUST_ROUNDS = 20
 MIN_WEIGHT_RAD = 0.01
@@ -100,12 +100,14 @@ def up_from_cameras(
         sign = float(np.sign(((axes.up - axes.forward) @ normal).sum())) or 1.0
         return UpEstimate(sign * normal, "the horizontal edges of the pictures")
     alike_up, alike_forward = float(np.linalg.norm(mean_up)), float(np.linalg.norm(mean_forward))
-    if alike_forward > ALIKE and (alike_up < SCATTERED or _is_survey(centres, mean_up, mean_forward)):
+    if alike_forward > MIN_ALIKE_LENGTH and (
+        alike_up < MAX_SCATTERED_LENGTH or _is_survey(centres, mean_up, mean_forward)
+    ):
         ground = _ground_normal(points, centres, -_unit(mean_forward))
-        if ground is not None and alike_forward < STEADY:
+        if ground is not None and alike_forward < MIN_STEADY_LENGTH:
             return UpEstimate(ground, "the ground below cameras that look down")
         return UpEstimate(-_unit(mean_forward), "the viewing direction of cameras that look down")
-    if alike_up > SCATTERED:
+    if alike_up > MAX_SCATTERED_LENGTH:
         return UpEstimate(_unit(mean_up), "the upper edges of the pictures")
     return UpEstimate(_unit(mean_up - mean_forward), "the pictures' upper edges and viewing directions")
 
@@ -207,8 +209,8 @@ def _is_survey(
     """
     up, forward = _unit(mean_up), _unit(mean_forward)
     along_up, along_right, ahead = (float(np.std(centres @ axis)) for axis in (up, np.cross(forward, up), forward))
-    is_walk = ahead >= max(along_up, along_right) and float(np.linalg.norm(mean_forward)) < PARALLEL
-    return along_up > GRID * along_right and not is_walk
+    is_walk = ahead >= max(along_up, along_right) and float(np.linalg.norm(mean_forward)) < MIN_PARALLEL_LENGTH
+    return along_up > MIN_GRID_RATIO * along_right and not is_walk
 
 
 def _ground_normal(

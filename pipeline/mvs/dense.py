@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_search import AGREEING, DepthSearch, SearchPlan
+from splatpipe.pipeline.mvs.depth_search import MIN_AGREEING, DepthSearch, SearchPlan
 from splatpipe.pipeline.mvs.neighbours import load_tracks
 from splatpipe.pipeline.mvs.options import DENSE_MEGAPIXELS
 from splatpipe.pipeline.photos.pixels.covering import covering_photos
 from splatpipe.pipeline.photos.pixels.dataset import View
 
-WIDER = 1.25  # search this many times nearer than the sparse points: thin places have no points yet
+NEAR_MARGIN = 1.25  # factor by which the search starts nearer than the sparse points: thin places have none yet
 NEIGHBOURS = 8  # photos that a photo is matched with, and whose depths may confirm its own
 CELLS = 64  # across a photo's width; a cell with a sparse point gets no dense one
 FEW_PHOTOS = 48  # up to this many, all are used, of more, some: depths that three photos confirm need overlap
@@ -93,7 +93,7 @@ def dense_points(
         StageError: if the model or a photo cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="depths-", dir=folder) as kept:
-        plan = SearchPlan(cover.megapixels, WIDER, False, NEIGHBOURS, NEIGHBOURS)
+        plan = SearchPlan(cover.megapixels, NEAR_MARGIN, False, NEIGHBOURS, NEIGHBOURS)
         search = DepthSearch.begin(dataset, views, Path(kept), plan)
         search.run(threads, report)
         found = []
@@ -123,7 +123,7 @@ def _confirmed_points(search: DepthSearch, number: int) -> DensePoints | None:
     if agreement is None:
         return None
     camera, rows, columns = search.cameras[number], agreement.rows, agreement.columns
-    sure = np.flatnonzero(agreement.votes >= AGREEING)
+    sure = np.flatnonzero(agreement.votes >= MIN_AGREEING)
     cell = _cells(camera, columns[sure] + 0.5, rows[sure] + 0.5)
     taken = camera.project(search.tracks.xyz[search.tracks.seen[number]])
     thin = ~np.isin(cell, _cells(camera, taken[:, 0], taken[:, 1]))

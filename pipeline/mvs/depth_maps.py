@@ -21,15 +21,15 @@ from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_search import AGREEING, ConfirmedDepths, DepthSearch, SearchPlan
+from splatpipe.pipeline.mvs.depth_search import MIN_AGREEING, ConfirmedDepths, DepthSearch, SearchPlan
 from splatpipe.pipeline.mvs.edges import pixels_behind
 from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.splat.containers.archives import open_archive
 
 LIST = "maps.json"
-COMPARED = 16  # neighbours that a photo is matched with: few photos, and not the nearest, see behind hedges
-CONFIRMING = 24  # neighbours that may confirm a depth: 20 confirm 96 % of the points that three photos see, 8 only 39 %
-WIDER = 2.0  # search this many times nearer than the sparse points: a treetop close to the camera has none
+MAX_MATCHED = 16  # neighbours that a photo is matched with: few photos, and not the nearest, see behind hedges
+MAX_CONFIRMING = 24  # neighbours that may confirm a depth: 20 confirm 96 % of points that three photos see, 8 only 39 %
+NEAR_MARGIN = 2.0  # factor by which the search starts nearer than the sparse points: a close treetop has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def find_depth_maps(
     Raises:
         StageError: if the model or a photo cannot be read.
     """
-    plan = SearchPlan(megapixels, WIDER, True, COMPARED, CONFIRMING)
+    plan = SearchPlan(megapixels, NEAR_MARGIN, True, MAX_MATCHED, MAX_CONFIRMING)
     search = DepthSearch.begin(dataset, views, folder, plan)
     search.run(threads, report)
     maps = confirmed_maps(search.cameras, search.agreement, threads, report)
@@ -153,7 +153,7 @@ def _with_edges(search: DepthSearch, numbered: tuple[int, tuple[Camera, DepthMap
     number, (camera, found) = numbered
     rows, columns, depth = pixels_behind(found.depth, search.colours(number))
     found.depth[rows, columns] = depth
-    found.confidence[rows, columns] = AGREEING
+    found.confidence[rows, columns] = MIN_AGREEING
     return camera, found
 
 
@@ -181,7 +181,7 @@ def _confirmed_map(camera: Camera, agreement: ConfirmedDepths | None) -> DepthMa
     depth = np.zeros((camera.height, camera.width), np.float32)
     confidence = np.zeros(depth.shape, np.uint8)
     if agreement is not None:
-        sure = agreement.votes >= AGREEING
+        sure = agreement.votes >= MIN_AGREEING
         rows, columns = agreement.rows[sure], agreement.columns[sure]
         depth[rows, columns] = 1.0 / agreement.inverse[sure]
         confidence[rows, columns] = agreement.votes[sure]

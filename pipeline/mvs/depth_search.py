@@ -29,8 +29,8 @@ from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.containers.archives import open_archive
 
-AGREEING = 2  # other photos that have to agree, at least
-TOLERANCE = 0.01  # share of the depth within which two photos agree;
+MIN_AGREEING = 2  # other photos that have to agree, at least
+DEPTH_TOLERANCE = 0.01  # share of the depth within which two photos agree;
 TOLERANCE_PX = 0.5  # for distant points, the share that moves the point by this much in the other photo,
 MAX_TOLERANCE = 0.2  # but at most this share
 
@@ -178,7 +178,7 @@ class DepthSearch:
             return
         bounds = inverse_depths(self.tracks, number, self.cameras[number], self.plan.wider)
         others = self.near[number][: self.plan.compared]
-        if bounds is None or len(others) < AGREEING:
+        if bounds is None or len(others) < MIN_AGREEING:
             return
         pictures = [self._picture(other) for other in others]
         found = find_depths(self._picture(number), pictures, bounds, number, self.plan.plain)
@@ -239,5 +239,5 @@ def confirm(
             to the first array, and a vote to the second.
     """
     parallax = camera.fx * float(np.linalg.norm(camera.centre() - photo.centre()))  # pixels, at a depth of one unit
-    agreeing = TOLERANCE, TOLERANCE_PX, MAX_TOLERANCE, max(parallax, 1e-9)
+    agreeing = DEPTH_TOLERANCE, TOLERANCE_PX, MAX_TOLERANCE, max(parallax, 1e-9)
     _native.confirm(inverse, native_camera(camera), places, agreeing, *found)

@@ -19,7 +19,7 @@ MIN_SHARED = 8  # points; two photos with fewer overlap by chance or only at an 
 MIN_POINTS = 20  # a photo with fewer has no reliable depth range
 DEPTH_PERCENTILES = (1.0, 99.0)  # percentiles that bound a photo's depths: without the few wrong points
 MAX_DEPTH_RATIO = 1000.0  # far over near end of a photo's depth range, at most
-BEYOND = 10.0  # times the depth of the farthest points: hills and trees behind have few; costs only a few more planes
+FAR_MARGIN = 10.0  # depth searched over that of the farthest points: hills and trees behind have few
 
 
 @dataclass(frozen=True)
@@ -110,4 +110,4 @@ def inverse_depths(tracks: SparseVisibility, view: int, camera: Camera, wider: f
     if depths.size < MIN_POINTS:
         return None
     near, far = (float(depth) for depth in np.percentile(depths, DEPTH_PERCENTILES))
-    return 1.0 / (far * BEYOND), wider / max(near, far / MAX_DEPTH_RATIO)
+    return 1.0 / (far * FAR_MARGIN), wider / max(near, far / MAX_DEPTH_RATIO)

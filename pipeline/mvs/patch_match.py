@@ -22,7 +22,7 @@ ITERATIONS = (6, 3, 1)  # from the coarsest size; each size is half the next
 PERTURBATION_STEPS = (0, 1, 4)  # reductions of the perturbation at the start: planes of larger sizes are nearly right
 MIN_SIDE = 24  # pixels; a photo is not halved below this
 MAX_COST = 0.5  # for the two best-matching photos: a pixel with a higher cost has no depth
-FAR_END = 2.0  # times the smallest inverse depth; anything farther, e.g. clouds, has no usable depth
+MIN_INVERSE_RATIO = 2.0  # least inverse depth of a result over that searched; what is farther, e.g. clouds, has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def find_depths(
             costs,
         )
     usable = photo.whole() if plain else photo.textured()
-    found = usable & (costs <= MAX_COST) & (planes[0] > FAR_END * inverse_range[0])
+    found = usable & (costs <= MAX_COST) & (planes[0] > MIN_INVERSE_RATIO * inverse_range[0])
     return DepthEstimate(np.where(found, planes[0], np.float32(0.0)), costs)
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, UInt8
 from splatpipe.pipeline.geometry.camera import Camera
 
 WINDOW = 11  # side of the matching window in pixels, as in the kernel
-NOISE = 1.5  # grey values: contrast below this counts as noise
-TEXTURE = 3.0  # standard deviation in the matching window: below it, a pixel has no depth,
+NOISE_GREY = 1.5  # contrast in grey values below which it counts as noise
+MIN_TEXTURE_GREY = 3.0  # standard deviation in the matching window: below it, a pixel has no depth,
 NARROW_WINDOW = 3  # and neither where a window of this side has no contrast, e.g. sky beside a roof
 
 
@@ -41,7 +41,7 @@ class Picture:
         """Pixels with texture around them and nothing masked in the window."""
         grey = self.grey.astype(np.float32)
         wide, narrow = (_variance(grey, side) for side in (WINDOW, NARROW_WINDOW))
-        return np.asarray((wide > TEXTURE**2) & (narrow > NOISE**2) & self.whole())
+        return np.asarray((wide > MIN_TEXTURE_GREY**2) & (narrow > NOISE_GREY**2) & self.whole())
 
     def whole(self) -> Bool[np.ndarray, "h w"]:
         """Pixels whose window holds nothing masked and lies inside the photo."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.depth_maps import CONFIRMING, DepthMap, confirmed_maps
+from splatpipe.pipeline.mvs.depth_maps import MAX_CONFIRMING, DepthMap, confirmed_maps
 from splatpipe.pipeline.mvs.depth_search import ConfirmedDepths, Inverse, agreement_of
 from splatpipe.pipeline.mvs.neighbours import load_tracks, neighbours
 from splatpipe.pipeline.mvs.patch_match import DepthEstimate
@@ -50,7 +50,7 @@ def rendered_depth_maps(
         _render_to_file(folder / f"{number}.npy", partial(depth_of, camera))
         report.progress(number + 1, len(cameras), "rendering depths", "photos")
     tracks = load_tracks(dataset, [camera.name for camera in cameras])
-    near = neighbours(tracks, cameras, CONFIRMING)
+    near = neighbours(tracks, cameras, MAX_CONFIRMING)
 
     def agreement(number: int) -> ConfirmedDepths | None:
         inverse = _load_inverse(folder, number)

@@ -23,8 +23,8 @@ from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 from splatpipe.pipeline.splat.sky.panorama import STEP_PX, Panorama, composite_over
 
 Model = tuple[Gaussians, Panorama | None]
-SURFACE = 0.5  # minimum alpha of a pixel that shows a surface, as for the median depth
-MEAN_OFF_PX = 2.0  # maximum distance of a mean depth from the median, in GSD: beyond it the mean follows haze
+MIN_SURFACE_ALPHA = 0.5  # minimum alpha of a pixel that shows a surface, as for the median depth
+MAX_MEAN_OFFSET_PX = 2.0  # maximum distance of a mean depth from the median, in GSD: beyond it the mean follows haze
 STRIP_PIXELS = 1 << 21  # rendered at once: an image of 100 megapixels takes no more memory than one of two
 
 
@@ -148,8 +148,8 @@ def render_mean_depth(
 ) -> Float[np.ndarray, "h w"]:
     """A camera's mean depth along each ray, weighted by contribution; units as for ``render_depth``.
 
-    Clamped to ``MEAN_OFF_PX`` GSD around the median, which distant background shining through does not pull behind the
-    surface. For a flattened model the mean is the more accurate of the two.
+    Clamped to ``MAX_MEAN_OFFSET_PX`` GSD around the median, which distant background shining through does not
+    pull behind the surface. For a flattened model the mean is the more accurate of the two.
     """
     with torch.no_grad():
         return _by_strips(camera, lambda strip: _mean_depths(gaussians, strip, options.for_depths()))
@@ -158,9 +158,9 @@ def render_mean_depth(
 def _mean_depths(gaussians: Gaussians, camera: Camera, options: rasterizer.RenderOptions) -> Float[np.ndarray, "h w"]:
     rendered = rasterizer.render(gaussians, camera, options)
     median = rendered.median_depth
-    seen = (rendered.alpha >= SURFACE) & (median > 0.0)
+    seen = (rendered.alpha >= MIN_SURFACE_ALPHA) & (median > 0.0)
     off = torch.where(seen, rendered.depth_sum, 0.0) / torch.where(seen, rendered.alpha, 1.0) - median
-    most = MEAN_OFF_PX / camera.fx * median
+    most = MAX_MEAN_OFFSET_PX / camera.fx * median
     return np.asarray(torch.where(seen, median + torch.clamp(off, -most, most), 0.0).cpu().numpy())
 
 
@@ -195,5 +195,5 @@ def _directions(coloured: Gaussians, camera: Camera, options: rasterizer.RenderO
     alpha = rendered.alpha[..., None]
     summed = 2.0 * rendered.colour - alpha
     length = torch.linalg.vector_norm(summed, dim=2, keepdim=True)
-    seen = (alpha >= SURFACE) & (length > 0.0)
+    seen = (alpha >= MIN_SURFACE_ALPHA) & (length > 0.0)
     return np.asarray(torch.where(seen, summed / length.clamp_min(1e-12), 0.0).cpu().numpy())

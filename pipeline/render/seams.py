@@ -34,16 +34,16 @@ from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 KINDS = {"alpha": "gap", "hole": "gap", "bump": "doubled", "spread": "doubled", "line": "colour", "step": "colour"}
 WIDTHS = (2, 4, 8, 16)  # half widths of a strip, pixels: of a gap, or of a step made by Gaussians of several pixels
-REACH = 160  # columns beside the border that are compared with it
-GUARD = 2  # times the strip's width: nearer columns see the seam themselves
+REACH_COLUMNS = 160  # columns beside the border that are compared with it
+GUARD_WIDTHS = 2  # columns left out beside the border, over the strip's width: they see the seam themselves
 ROW_CAPS = {"alpha": 1.0, "hole": 2.0, "bump": 2.0, "spread": 2.0, "line": 0.05, "step": 0.08}  # cap per row: a single
 # edge of a house must not outweigh all others
-STATION = 0.7  # spacing of cameras along the border, as a share of the height above the surface
-FARTHEST = 2.5  # times that height: farther rows are seen at too small an angle
+STATION_SPACING = 0.7  # spacing of cameras along the border, as a share of the height above the surface
+MAX_DEPTH_RATIO = 2.5  # depth of a row over that height, at most: farther ones are seen at too small an angle
 PIECE_LENGTH = 0.35  # least length of a piece of border that is judged by itself, over the height above the surface
 MIN_ROWS = 24  # per piece, over all images
 TILT_RAD = math.radians(45.0)  # angle of the oblique cameras below the horizon
-LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks/seams.py` prints what they detect
+SEAM_LIMITS = {  # minimum score and size of a seam along a whole border; `benchmarks/seams.py` prints what they detect
     "alpha": (5.0, 0.002),
     "hole": (4.2, 0.15),
     "bump": (4.2, 0.25),
@@ -88,7 +88,7 @@ class Response:
             score_factor: Factor on the minimum score.
             size_factor: Factor on the minimum size.
         """
-        score, size = LIMITS[self.measure]
+        score, size = SEAM_LIMITS[self.measure]
         return min(self.score / (score * score_factor), self.size / (size * size_factor))
 
 
@@ -151,7 +151,7 @@ def border_cameras(
             tilted = sign * math.cos(TILT_RAD) * ahead - math.sin(TILT_RAD) * plan.up
             found.append(_placed(_view(middle, plan, sign * ahead, tilted), centre - sign * back))
         found.append(_placed(down, centre))
-        along += STATION * height
+        along += STATION_SPACING * height
     return found, float(np.median(heights)) if heights else 0.0
 
 
@@ -213,7 +213,7 @@ def responses(
         chosen = [np.ones(len(number), np.bool_), *(number == piece for piece in range(pieces))]
         counts += [int(part.sum()) for part in chosen]
         reach = rows.channels.shape[2] // 2
-        for width in (width for width in WIDTHS if reach >= (4 + GUARD) * width + 4):  # narrow images have fewer
+        for width in (width for width in WIDTHS if reach >= (4 + GUARD_WIDTHS) * width + 4):  # narrow images have fewer
             for name, values in _measured(rows.channels, width).items():
                 added = np.stack([values[:, part].sum(axis=1) for part in chosen])
                 sums[width, name] = sums.get((width, name), 0.0) + added
@@ -230,7 +230,7 @@ def _response(mean: Float64[np.ndarray, "_ k"], which: tuple[str, int, int], row
     """The response from a measure's mean over rows at each column."""
     curve = np.linalg.norm(mean, axis=0) if len(mean) > 1 else mean[0]
     middle = len(curve) // 2
-    beside = np.abs(np.arange(len(curve)) - middle) >= GUARD * which[2] + 4
+    beside = np.abs(np.arange(len(curve)) - middle) >= GUARD_WIDTHS * which[2] + 4
     return Response(*which, float(curve[middle]), curve[beside], rows)
 
 
@@ -275,7 +275,7 @@ def _rows(
     level = np.nanmedian(about[image_rows], axis=1)
     pixels = np.column_stack([np.full(len(image_rows), camera.cx), image_rows + 0.5])
     along = line.along(plan.places(camera.unproject(pixels, level)))
-    inside = (along >= 0.0) & (along <= line.length) & (level <= FARTHEST * height)
+    inside = (along >= 0.0) & (along <= line.length) & (level <= MAX_DEPTH_RATIO * height)
     image_rows, level, along = image_rows[inside], level[inside], along[inside]
     pixel = (level / camera.fx)[:, None]
     channels = np.zeros((6, len(image_rows), 2 * reach))
@@ -295,7 +295,7 @@ def _stack(
     with torch.no_grad():
         seen = rasterizer.render(gaussians, camera, options).colour
         deep = rasterizer.render(gaussians, camera, replace(options.for_depths(), depth_origin=height))
-    reach = min(REACH, camera.width // 2)
+    reach = min(REACH_COLUMNS, camera.width // 2)
     columns = slice(camera.width // 2 - reach, camera.width // 2 + reach)
     parts = (deep.alpha, deep.median_depth, deep.depth_sum, deep.depth_square_sum, *seen.unbind(2))
     alpha, depth, sums, squares, *colours = (part.double().numpy(force=True)[:, columns] for part in parts)
@@ -314,7 +314,7 @@ def _height_above(gaussians: Gaussians, camera: Camera, options: rasterizer.Rend
 
 def _view(like: Camera, plan: GroundPlan, ahead: np.ndarray, forward: np.ndarray) -> Camera:
     """A centred camera of even size at the origin that looks forward, its middle column in a vertical plane."""
-    width, height = min(like.width - like.width % 2, 2 * REACH), like.height - like.height % 2
+    width, height = min(like.width - like.width % 2, 2 * REACH_COLUMNS), like.height - like.height % 2
     right = np.cross(ahead, plan.up)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])

@@ -25,9 +25,7 @@ from splatpipe.pipeline.survey.control.residuals import accuracy_table
 from splatpipe.pipeline.survey.crs.frames import Frame, load_frame
 
 MAX_DEPTH_STEP = 0.02  # relative, between neighbouring pixels of one surface: slopes have less, edges far more
-MIN_HELD_OUT_PHOTOS = (
-    3  # held-out photos of a point: with two, a single floater moves the median by half of its distance
-)
+MIN_HELD_OUT_PHOTOS = 3  # that show a point: with two, one floater moves the median by half of its distance
 DIGITS = 5  # decimals of lengths in metres: a hundredth of a millimetre
 POINT_FACTS = ("name", "role", "why", "surveyed_crs", "surveyed_m", "sigma_m", "estimated_m", "residual_m")
 DepthMap = Float[np.ndarray, "h w"]

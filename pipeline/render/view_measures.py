@@ -24,7 +24,7 @@ ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels shown as the br
 EQUAL_DB = 100.0  # stands for the infinite PSNR of identical images: JSON has no infinity
 MASKED_GREY = 128
 MIN_INSIDE_SHARE = 0.01  # share of a photo inside the boundary below which it is not measured
-LONGEST_STEM = 100  # characters; file systems allow 255 bytes, and a letter may take four
+MAX_STEM_CHARACTERS = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
 def evaluate_view(
@@ -151,7 +151,7 @@ def flat_stems(names: Sequence[str]) -> list[str]:
     for name in names:
         flat = name.rpartition(".")[0] or name
         flat = "".join("_" if letter in '/\\:*?"<>|' or ord(letter) < 32 else letter for letter in flat)
-        flat = flat.strip(". ")[-LONGEST_STEM:] or "photo"
+        flat = flat.strip(". ")[-MAX_STEM_CHARACTERS:] or "photo"
         stem, copies = flat, 1
         while stem.casefold() in taken:
             copies += 1

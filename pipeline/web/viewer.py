@@ -26,7 +26,7 @@ POLICY = (
     " style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:;"
     " base-uri 'none'; form-action 'none'"
 )
-MAX_POINTS = 150_000  # in the page, 15 bytes each; more are thinned evenly
+MAX_POINTS = 150_000  # points in the page, 15 bytes each; more are thinned evenly
 SIZE_QUANTILES = (0.05, 0.95)  # quantiles of the sparse points along each axis that bound the scene
 NEARLY_MOST_SHARE = 0.9  # points in focus, over the most: a few on the far side need not push the view away
 NEAR_PER_SIZE = 1e-3  # near plane as a share of the scene's size, if the caller gives none

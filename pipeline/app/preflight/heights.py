@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.files.names import printable
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 from splatpipe.pipeline.sfm.lenses.known_lenses import state_lenses
-from splatpipe.pipeline.survey.adjustment.adjusted_positions import MANY_GSDS
+from splatpipe.pipeline.survey.adjustment.adjusted_positions import MAX_MOVED_GSDS
 from splatpipe.pipeline.survey.adjustment.block_accuracy import ninety_five
 from splatpipe.pipeline.survey.adjustment.position_adjustment import FOCAL_SHARES, OTHER_FOCAL_SHARE
 from splatpipe.pipeline.survey.adjustment.predicted_flight import FlightCamera, PredictedAccuracy, predict_accuracy
@@ -62,11 +62,15 @@ def height_findings(intake: Intake, predicted: PredictedAccuracy | None, control
         return _nadir_only(intake)
     findings = []
     stated_across, stated_up = predicted.stated_m
-    if not controlled and predicted.plan_m > MANY_GSDS * max(predicted.gsd_m, stated_across) and predicted.one_heading:
+    if (
+        not controlled
+        and predicted.plan_m > MAX_MOVED_GSDS * max(predicted.gsd_m, stated_across)
+        and predicted.one_heading
+    ):
         findings.append(_one_heading(predicted))
-    if predicted.height_m <= MANY_GSDS * predicted.gsd_m:
+    if predicted.height_m <= MAX_MOVED_GSDS * predicted.gsd_m:
         return findings
-    if predicted.height_m <= MANY_GSDS * stated_up:  # the positions themselves are no better
+    if predicted.height_m <= MAX_MOVED_GSDS * stated_up:  # the positions themselves are no better
         return [*findings, *_nadir_only(intake)]
     return findings if controlled else [*findings, _heights_uncertain(predicted)]
 

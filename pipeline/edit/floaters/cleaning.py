@@ -28,17 +28,17 @@ Progress = Callable[[int, int], None]
 
 TRANSPARENT = 0.01
 """Invisible opacity: two and a half steps of an 8-bit image, and a few overlapping ones stay invisible."""
-FAINT = 0.03  # opacity negligible where no photo shows it: seven steps of an 8-bit image at its very centre
-SOLID = 0.1  # least opacity of solid objects: haze holds nothing
+FAINT_OPACITY = 0.03  # opacity negligible where no photo shows it: seven steps of an 8-bit image at its very centre
+SOLID_OPACITY = 0.1  # least opacity of solid objects: haze holds nothing
 SEEN_PIXELS = 1.0  # visible pixels, over all photos, that make a Gaussian count as seen
 UNSEEN_PIXELS = 0.1
 FLOATING_SHARE = 0.5  # share of a Gaussian's visible area that lies in front of everything around it
 SUSPECTED_SHARE = 0.3  # visible share in front of everything that gets tested on images: most of these are real
-FEW_PHOTOS = 2.0  # that see a loose Gaussian: training can put anything in front of a single photo
-OVERSIZED = 0.2  # times the distance to the nearest camera: a floating Gaussian's large standard deviation
-HAZE = 0.3  # opacity below which a very large Gaussian is not an object, if there are no photos to tell
-EXTENT = (0.05, 0.95)  # quantiles of the centres that bound the scene's extent
-BORDER = 0.8  # share of a Gaussian's visibility at image borders above which it is hardly covered
+MIN_PHOTOS = 2.0  # photos that must see a loose Gaussian: training can put anything in front of a single photo
+OVERSIZED_RATIO = 0.2  # large standard deviation of a floating Gaussian over its distance to the nearest camera
+HAZE_OPACITY = 0.3  # opacity below which a very large Gaussian is not an object, if there are no photos to tell
+EXTENT_QUANTILES = (0.05, 0.95)  # quantiles of the centres that bound the scene's extent
+BORDER_SHARE = 0.8  # share of a Gaussian's visibility at image borders above which it is hardly covered
 FEW = 100  # Gaussians in a connected group too small to be the scene
 
 
@@ -95,7 +95,7 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
     """Yield the reasons for removal and the Gaussians each applies to."""
     opacity = torch.sigmoid(gaussians.opacity_logits.detach()).numpy(force=True)
     yield "transparent", opacity < TRANSPARENT
-    shapes, solid = GaussianShapes.of(gaussians), opacity >= SOLID
+    shapes, solid = GaussianShapes.of(gaussians), opacity >= SOLID_OPACITY
     if photos is None or not photos.cameras:
         yield "oversized", _haze(shapes, opacity)
         yield "isolated", far_groups(shapes, LOOSE, solid, FEW)
@@ -108,9 +108,9 @@ def _found(gaussians: Gaussians, photos: TrainingPhotos | None, on_progress: Pro
     ground = seen & ~floats & solid
     loose = floats & ~held(shapes, LOOSE, ground, floats & solid)
     large = floats & _oversized(shapes, photos)
-    yield "seen by too few photos", loose & (found.photos < FEW_PHOTOS)
+    yield "seen by too few photos", loose & (found.photos < MIN_PHOTOS)
     unseen = found.weight < UNSEEN_PIXELS
-    yield "seen by none", unseen & ((opacity < FAINT) | ~held(shapes, LOOSE, seen & solid, unseen))
+    yield "seen by none", unseen & ((opacity < FAINT_OPACITY) | ~held(shapes, LOOSE, seen & solid, unseen))
     yield "beyond the photos", _at_edges(found, shapes, seen & solid)
     if photos.picture is None:
         yield "floating", loose & solid & ~large  # large ones may be all that represents the far background
@@ -128,16 +128,18 @@ def _oversized(shapes: GaussianShapes, photos: TrainingPhotos) -> Flags:
     nearest = np.full(len(shapes.centres), np.inf)
     for camera in photos.cameras:
         np.minimum(nearest, np.linalg.norm(shapes.centres - camera.centre(), axis=1), out=nearest)
-    return np.asarray(shapes.largest > OVERSIZED * nearest)
+    return np.asarray(shapes.largest > OVERSIZED_RATIO * nearest)
 
 
 def _haze(shapes: GaussianShapes, opacity: Float32[np.ndarray, " n"]) -> Flags:
     """Which Gaussians are very large for the scene and faint; large solid ones may be its sky."""
-    low, high = np.quantile(shapes.centres, EXTENT, axis=0) if len(shapes.centres) else (np.zeros(3), np.zeros(3))
-    return np.asarray((shapes.largest > OVERSIZED * float(np.linalg.norm(high - low))) & (opacity < HAZE))
+    low, high = (
+        np.quantile(shapes.centres, EXTENT_QUANTILES, axis=0) if len(shapes.centres) else (np.zeros(3), np.zeros(3))
+    )
+    return np.asarray((shapes.largest > OVERSIZED_RATIO * float(np.linalg.norm(high - low))) & (opacity < HAZE_OPACITY))
 
 
 def _at_edges(found: GaussianVisibility, shapes: GaussianShapes, solid: Flags) -> Flags:
     """Which Gaussians only the borders of one or two photos show and are not held by better covered ones."""
-    rough = solid & (found.border > BORDER) & (found.photos < FEW_PHOTOS)
+    rough = solid & (found.border > BORDER_SHARE) & (found.photos < MIN_PHOTOS)
     return np.asarray(rough & ~held(shapes, LOOSE, solid & ~rough, rough))

@@ -16,7 +16,7 @@ from jaxtyping import Float32, UInt8
 LINE_SHARE = 0.1
 """Largest extent of an island as a share of an image's longer side: 63 pixels at 0.3 megapixels."""
 DIRECTIONS = 8
-BEYOND = 4.0  # times the farthest depth, the depth of pixels without a surface: the sky is behind everything
+SKY_DEPTH_RATIO = 4.0  # depth of pixels without a surface over the farthest depth: the sky is behind everything
 
 
 def without_islands(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -27,8 +27,8 @@ def without_islands(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h
     """
     farthest = float(depth.max(initial=0.0))
     if farthest <= 0.0:
-        return np.full_like(depth, BEYOND)
-    solid = np.where(depth > 0.0, depth, np.float32(BEYOND * farthest))
+        return np.full_like(depth, SKY_DEPTH_RATIO)
+    solid = np.where(depth > 0.0, depth, np.float32(SKY_DEPTH_RATIO * farthest))
     least = np.full_like(solid, np.inf)
     for line in _lines(max(3, round(LINE_SHARE * max(depth.shape)))):
         closed = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, line, borderType=cv2.BORDER_REPLICATE)

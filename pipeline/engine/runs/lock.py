@@ -33,12 +33,12 @@ from splatpipe.pipeline.engine.machine import LOCAL_KINDS, mount_of
 
 LOCK_FILE = ".lock"  # below stages/; it is never removed, and only its holder works
 PATIENCE_S = 6.0  # a killed run's worker may take a moment to die
-HEARTBEAT_S = 4.0  # between touches; rare enough not to burden a server
-SILENCE_S = 20.0  # without a touch: five missed ones cannot be explained by a busy disk
+HEARTBEAT_S = 4.0  # between touches of the lock's file; rare enough not to burden a server
+SILENCE_S = 20.0  # without a touch, a lock is abandoned: five missed ones cannot be explained by a busy disk
 SETTLE_S = 1.0  # time for two machines that sign at once to see which was last
 POLL_S = 0.25
 MAX_SIGNATURE_BYTES = 4096  # bytes read of a signature
-WIDTH = 1024  # bytes to which signatures are padded: of two written over each other, the last is intact
+SIGNATURE_BYTES = 1024  # bytes to which signatures are padded: of two written over each other, the last is intact
 NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF}
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # identifies a machine's boot, in all of its containers alike
 
@@ -262,7 +262,7 @@ def _lock_and_sign(path: Path, descriptor: int, notify: Notify, *, wait: bool) -
     _wait_for_silence(path, waiting)
     holder = Holder.here()
     os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"{json.dumps(asdict(holder))}\n".encode().ljust(WIDTH), 0)
+    os.pwrite(descriptor, f"{json.dumps(asdict(holder))}\n".encode().ljust(SIGNATURE_BYTES), 0)
     os.fsync(descriptor)
     mount = mount_of(path)
     if mount is not None and mount.kind not in LOCAL_KINDS:

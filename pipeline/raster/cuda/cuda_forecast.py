@@ -17,11 +17,11 @@ from splatpipe.pipeline.raster.cuda.cuda_api import SplatFrameFacts
 FIRST_PAIRS_A_GAUSSIAN = 8  # for a first frame; a trained Gaussian touches 3 to 10 tiles
 FIRST_PAIRS_A_TILE = 64  # for a start with few, large Gaussians, which fill the tiles
 FIRST_PASSES = 8  # once: a wrong guess then costs empty launches, and the launch for the rest is slower
-MARGIN = 1.25  # over the recent maximum: views differ, and the model grows
-WINDOW = 512  # frames after which older maxima start to be forgotten: more than most trainings have photos
+CAPACITY_MARGIN = 1.25  # capacity over the recent maximum: views differ, and the model grows
+WINDOW_FRAMES = 512  # frames after which older maxima start to be forgotten: more than most trainings have photos
 PAIR_BYTES = 64  # per pair, in the frame and its backward pass
 MEMORY_SHARE = 1 / 16  # share of the device's memory for pairs: several chunks are binned twice, so prefer a single one
-FEWEST_PAIRS, MAX_PAIRS = 1 << 22, 1 << 28  # at a time: for a small device, filling it; and 17 GB of them
+MIN_PAIRS, MAX_PAIRS = 1 << 22, 1 << 28  # at a time: for a small device, filling it; and 17 GB of them
 STEPS_AN_OCTAVE = 8  # sizes that capacities are rounded up to, so that torch's allocator reuses the last frame's memory
 MAX_TILES = 1 << 16  # per chunk, as in frame.h
 
@@ -106,7 +106,7 @@ class Forecast:
             in chunks.
     """
 
-    def __init__(self, most_pairs: int = FEWEST_PAIRS) -> None:
+    def __init__(self, most_pairs: int = MIN_PAIRS) -> None:
         self.most_pairs = most_pairs
         self._readings: deque[PendingFacts] = deque()
         self._recent: FrameFacts | None = None  # the most of this window's frames
@@ -146,9 +146,9 @@ class Forecast:
     def update(self, facts: FrameFacts) -> None:
         """Learn from a frame."""
         self._seen += 1
-        if self._seen > WINDOW:
+        if self._seen > WINDOW_FRAMES:
             self._before, self._recent, self._seen = self._recent, None, 1
-        if self._recent is None or self._foreseen(self._recent, facts.size) <= facts.pairs * MARGIN:
+        if self._recent is None or self._foreseen(self._recent, facts.size) <= facts.pairs * CAPACITY_MARGIN:
             self._recent = facts
 
     def shrink(self) -> bool:
@@ -162,7 +162,7 @@ class Forecast:
     def _foreseen(facts: FrameFacts, size: FrameSize) -> int:
         """Pairs forecast from a frame of another size: scaled up with tiles and Gaussians, never down."""
         grown = max(1.0, size.tiles / max(1, facts.size.tiles)) * max(1.0, size.count / max(1, facts.size.count))
-        return int(MARGIN * facts.pairs * grown)
+        return int(CAPACITY_MARGIN * facts.pairs * grown)
 
 
 def most_pairs_of(memory_bytes: int) -> int:
@@ -171,7 +171,7 @@ def most_pairs_of(memory_bytes: int) -> int:
     Args:
         memory_bytes: The device's memory.
     """
-    return min(MAX_PAIRS, max(FEWEST_PAIRS, int(MEMORY_SHARE * memory_bytes) // PAIR_BYTES))
+    return min(MAX_PAIRS, max(MIN_PAIRS, int(MEMORY_SHARE * memory_bytes) // PAIR_BYTES))
 
 
 def _rounded_up(pairs: int) -> int:

@@ -34,7 +34,7 @@ ACCURATE_M = 0.5  # standard deviation up to which positions bend the model: RTK
 MIN_POSITIONS = 8
 MIN_TIES = 20  # points that a photo must have at the median, to be adjusted
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if positions deform the model by less, it is not adjusted
-MANY_GSDS = 3.0  # ground sample distances, or standard deviations of a position: ground heights should be as good
+MAX_MOVED_GSDS = 3.0  # ground sample distances, or standard deviations of a position: ground heights should be as good
 HEIGHTS_SHOWN = 400
 
 
@@ -288,7 +288,7 @@ def height_sentence(together_m: float, gsd: float | None, stated_m: float) -> st
         gsd: Ground sample distance.
         stated_m: Typical stated standard deviation of the positions' heights.
     """
-    if gsd is None or stated_m > ACCURATE_M or together_m <= MANY_GSDS * max(gsd, stated_m):
+    if gsd is None or stated_m > ACCURATE_M or together_m <= MAX_MOVED_GSDS * max(gsd, stated_m):
         return None
     return (
         f"heights of the ground are uncertain by ±{metres_in_words(ninety_five(together_m))} together (95 %): photos"

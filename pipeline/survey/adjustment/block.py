@@ -25,7 +25,7 @@ from splatpipe.pipeline.survey.adjustment.block_distances import NO_DISTANCES, D
 from splatpipe.pipeline.survey.adjustment.block_lens import MIN_DEPTH, Lens, lens_derivatives, project
 
 MAX_DENSE = 6000  # unknowns of a dense system: a thousand photos
-FLAT = 1e-12  # least ratio of a tie point's eigenvalues: nearly parallel rays
+MIN_EIGENVALUE_RATIO = 1e-12  # least ratio of a tie point's eigenvalues: nearly parallel rays
 
 
 # A symmetric matrix of normal equations: an array, or scipy's sparse array for very many unknowns.
@@ -146,7 +146,9 @@ def reduce_block(block: Block) -> ReducedBlock:
     information[:, diagonal, diagonal] += block.weights
     gradient_points = _summed(np.einsum("mka,mk->ma", point, residual), starts, block.point, p)
     gradient_points += block.weights * (block.points - block.stated) + _pull(block)
-    information[:, diagonal, diagonal] += FLAT * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
+    information[:, diagonal, diagonal] += (
+        MIN_EIGENVALUE_RATIO * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
+    )
     root = np.linalg.cholesky(information)  # information = root root'
     inverse_root = np.linalg.inv(root)
     own = np.swapaxes(inverse_root, 1, 2) @ inverse_root
@@ -215,7 +217,9 @@ def settle_points(block: Block, rounds: int = 2) -> Block:
         _, _, point, residual = _jacobians(block, lenses=False)
         information = _summed(np.einsum("mka,mkb->mab", point, point), starts, block.point, p)
         information[:, diagonal, diagonal] += block.weights
-        information[:, diagonal, diagonal] += FLAT * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
+        information[:, diagonal, diagonal] += (
+            MIN_EIGENVALUE_RATIO * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-30
+        )
         gradient = _summed(np.einsum("mka,mk->ma", point, residual), starts, block.point, p)
         gradient += block.weights * (block.points - block.stated) + _pull(block)
         step = -np.linalg.solve(information, gradient[:, :, None])[:, :, 0]

@@ -25,10 +25,10 @@ from splatpipe.pipeline.survey.adjustment.block_adjustment import (
 )
 from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95
 
-GROUND_POINTS = 400  # at which the ground's accuracy is evaluated
+GROUND_POINTS = 400  # points at which the ground's accuracy is evaluated
 MIN_VIEWS = 3  # photos that show a point of the ground at which accuracy is evaluated
 MAX_PHOTOS = 500  # whose covariance is propagated together
-FAR_RATIO = 2.0  # times the median distance from camera to point: the background is not the site
+MAX_DISTANCE_RATIO = 2.0  # distance over the median from camera to point: what is beyond is not the site
 MARK_SIGMA_PX = 0.5
 CONTROL_SIGMAS_M = (0.02, 0.02, 0.03)
 CROSS_STRIP_RISE = 0.25  # height of a cross strip over the other flights', as a share of the flying height
@@ -90,7 +90,7 @@ def accuracy_of(adjusted: AdjustedBlock, observed: PositionObservations) -> Bloc
     views = np.bincount(block.point, minlength=len(block.points))
     away = np.linalg.norm(block.points[block.point] - block.centres[block.photo], axis=1)
     distance = np.bincount(block.point, weights=away, minlength=len(views)) / np.maximum(views, 1)
-    near = distance <= FAR_RATIO * float(np.median(away)) if len(away) else np.ones(0, dtype=bool)
+    near = distance <= MAX_DISTANCE_RATIO * float(np.median(away)) if len(away) else np.ones(0, dtype=bool)
     seen = np.flatnonzero((views >= MIN_VIEWS) & (block.weights[:, 0] == 0.0) & near)
     chosen = seen[:: max(1, math.ceil(len(seen) / GROUND_POINTS))]
     return BlockAccuracy(

@@ -46,7 +46,7 @@ from splatpipe.pipeline.survey.adjustment.tie_points import (
     whole_model,
 )
 
-PART = 200  # positions whose noise is estimated together: the system is dense
+PART_POSITIONS = 200  # positions whose noise is estimated together: the system is dense
 SIMPLE = ("f", "k1")
 ALL = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
 ALL_FISHEYE = ("f", "aspect", "cx", "cy", "k1", "k2", "k3", "k4")
@@ -60,9 +60,9 @@ WEAK = {"k1": 0.3, "k2": 0.3, "k3": 0.3, "k4": 0.3, "p1": 0.01, "p2": 0.01, "asp
 CENTRE_SHARE = 0.02  # standard deviation of a principal point, as a share of the image's width
 MIN_PHOTOS = 8  # photos a camera needs for its lens to be freed
 MAX_ROUNDS = 4  # rounds of adjustment, noise and blunders
-HELD_OUT = 600  # tie points that judge the lens
-CAP = 4.0  # times the median error of such a point: a wrong match must not decide
-WORSE = 0.01  # relative, of predictions by a lens that is refused
+HELD_OUT_POINTS = 600  # tie points that judge the lens
+MAX_ERROR_RATIO = 4.0  # error of such a point over the median, at most: a wrong match must not decide
+MAX_ERROR_INCREASE = 0.01  # relative increase of prediction errors with which a lens is refused
 MIN_RELATIVE_CHANGE = 0.03  # relative change of the noise
 
 
@@ -328,7 +328,7 @@ class BlockPart:
 
 def parts_of(adjusted: AdjustedBlock, positions: StatedPositions) -> Iterator[BlockPart]:
     """Cut a block along the order of capture; a small one is its only part."""
-    count = max(1, round(len(positions) / PART))
+    count = max(1, round(len(positions) / PART_POSITIONS))
     if count == 1:
         system = centre_system(adjusted.reduced, len(adjusted.block))
         yield BlockPart(np.ones(len(positions), dtype=bool), adjusted.block, system, positions)
@@ -408,16 +408,16 @@ def _judged(
     views = np.bincount(table.point, minlength=len(table.ids))
     others = np.flatnonzero(~chosen & (views >= 3))
     picked = np.zeros(len(table.ids), dtype=bool)
-    picked[others[:: max(1, len(others) // HELD_OUT)]] = True
+    picked[others[:: max(1, len(others) // HELD_OUT_POINTS)]] = True
     errors = []
     for fit in (simple, whole):
         block = observing(table.only(picked), fit.adjusted.block, world_from_model)
         size = np.linalg.norm(image_errors(intersected(block)), axis=1)
         errors.append(np.where(np.isfinite(size), size, np.inf))
-    cap = CAP * float(np.median(np.minimum(*errors))) if picked.any() else 0.0
+    cap = MAX_ERROR_RATIO * float(np.median(np.minimum(*errors))) if picked.any() else 0.0
     px = [float(np.sqrt((np.minimum(each, cap) ** 2).mean())) if picked.any() else 0.0 for each in errors]
     metres = [_two(fit.predicted()) for fit in (simple, whole)]
-    worse = px[1] > (1.0 + WORSE) * px[0] and max(metres[1]) > (1.0 + WORSE) * max(metres[0])
+    worse = px[1] > (1.0 + MAX_ERROR_INCREASE) * px[0] and max(metres[1]) > (1.0 + MAX_ERROR_INCREASE) * max(metres[0])
     return LensJudgement(px[0], px[1], metres[0], metres[1], not worse)
 
 

@@ -26,11 +26,11 @@ USUAL = (
     0.9,
 )  # share of the variance that drifts, and its correlation from photo to photo: 50 photos prove neither
 DRIFTS = (USUAL, (0.0, 0.0), *((share, r) for share in (0.5, 0.8) for r in (0.5, 0.7, 0.8, 0.95)), (0.8, 0.9))
-UNPROVEN = 4.0  # least gain in minus twice the log-likelihood for another drift than usual (Akaike 1974)
+MIN_LIKELIHOOD_GAIN = 4.0  # least gain in minus twice the log-likelihood for another drift than usual (Akaike 1974)
 MAX_CHAIN = 200  # neighbours along a flight whose drift is modelled together
 MIN_CLASS = 10  # positions with a factor of their own
 PRIOR_DEGREES = 2.0  # weight of the stated standard deviation, for few positions
-LITTLE = 0.2  # its weight for many
+PRIOR_DEGREES_MANY = 0.2  # weight of the stated standard deviation, for many positions
 FEW_DEGREES = 10.0  # degrees of freedom below which a direction's factor is uncertain, and the other direction's counts
 FACTOR_ROUNDS = 12
 MIN_RELATIVE_CHANGE = 0.01  # relative, of a factor
@@ -222,7 +222,7 @@ def estimate_noise(system: CentreSystem, block: Block, positions: StatedPosition
         for drift in DRIFTS[1:]:
             tried = _iterate_factors(system, errors, positions, _with_drift(usual, half, *drift), rounds=3)
             cost = _fit(system, errors, positions, tried).cost
-            if cost < best - (UNPROVEN if noise is usual else 0.0):
+            if cost < best - (MIN_LIKELIHOOD_GAIN if noise is usual else 0.0):
                 best, noise = cost, tried
     return _iterate_factors(system, errors, positions, noise)
 
@@ -432,7 +432,7 @@ def _weighed(found: Float64[np.ndarray, "c 2"], degrees: Float64[np.ndarray, "c 
     Straight down, a tilt absorbs a horizontal error: where one direction has hardly any degrees of freedom, the prior
     is the other one's factor if that is larger, as a receiver that is worse than stated is so in both.
     """
-    weight = np.where(degrees >= FEW_DEGREES, LITTLE, PRIOR_DEGREES)
+    weight = np.where(degrees >= FEW_DEGREES, PRIOR_DEGREES_MANY, PRIOR_DEGREES)
     alone = (found + weight) / (degrees + weight)
     other = np.where(degrees[:, ::-1] >= FEW_DEGREES, np.maximum(alone[:, ::-1], 1.0), 1.0)
     mean = np.where(degrees >= FEW_DEGREES, 1.0, other)

@@ -33,18 +33,18 @@ from splatpipe.pipeline.survey.crs.geodesy import Origin
 from splatpipe.pipeline.survey.positions.photo_positions import Position
 
 MAX_PHOTOS = 120  # more are predicted from a part: two or three seconds
-DRAWN = 100  # points per photo, of which those that two photos show are thinned to PER_PHOTO in each
+DRAWN_POINTS = 100  # points per photo, of which those that two photos show are thinned to PER_PHOTO in each
 MIN_VIEWS = 2
 RELIEF_SHARE = 0.02  # standard deviation of the ground's heights over the flying height
-FURTHEST = 4.0  # times a photo's height: what is beyond is not matched
+MAX_DISTANCE_RATIO = 4.0  # distance over a photo's height beyond which points are not matched
 SEED = 41
-HEIGHT_BOUNDS_M = (2.0, 3000.0)  # above ground
+HEIGHT_BOUNDS_M = (2.0, 3000.0)  # bounds of a photo's height above ground
 SIMILAR_HEIGHTS = (0.25, 4.0)  # bounds on height over the typical one: others see something else, or are wrong
 MIN_REACH_RATIO = 0.1  # median reach of the photos over the height, below which they see nothing in space
 NEW_GROUND_SHARE = 0.07  # share of a footprint seen by no other photo: overlaps of 75-80 % along, 65-70 % across
-FILLED = 0.2  # least width over length of the flown area, to tell its density
-DOWN = math.cos(math.radians(15.0))  # views less steep show walls, which determine the focal length
-ONE_HEIGHT = 0.1  # range of the camera heights over the flying height
+MIN_ASPECT = 0.2  # least width over length of the flown area, to tell its density
+NADIR_COSINE = math.cos(math.radians(15.0))  # views less steep show walls, which determine the focal length
+MAX_HEIGHT_RANGE = 0.1  # range of the camera heights over the flying height
 ONE_HEADING = math.cos(math.radians(20.0))
 ODD_TILT, ODD_HEIGHT = math.sin(math.radians(5.0)), 0.05  # photos that tell focal length from height
 
@@ -206,8 +206,8 @@ def predict_accuracy(
         len(part.positions),
         len(positions),
         flight.angles_stated,
-        bool((flight.rotations[:, 2, 2] <= -DOWN).all()),
-        bool(np.ptp(flight.heights) <= ONE_HEIGHT * height),
+        bool((flight.rotations[:, 2, 2] <= -NADIR_COSINE).all()),
+        bool(np.ptp(flight.heights) <= MAX_HEIGHT_RANGE * height),
         _has_one_heading(flight),
     )
 
@@ -287,7 +287,7 @@ def _ground(flight: _Flight) -> float | None:
     if takeoff is not None:
         return takeoff
     extent = np.linalg.svd(flight.centres[:, :2] - flight.centres[:, :2].mean(axis=0), compute_uv=False)
-    if extent[0] <= 0.0 or extent[1] < FILLED * extent[0]:
+    if extent[0] <= 0.0 or extent[1] < MIN_ASPECT * extent[0]:
         return None
     area = 12.0 * float(extent[0] * extent[1]) / len(flight.centres)  # area of a rectangle with this spread
     frame = float(np.median([camera.width * camera.height / camera.focal_px**2 for camera in flight.cameras]))
@@ -361,10 +361,10 @@ def _draw_points(flight: _Flight) -> Float64[np.ndarray, "p 3"]:
     found = []
     for camera, centre, rotation in zip(flight.cameras, flight.centres, flight.rotations, strict=True):
         size = np.array([camera.width, camera.height])
-        flat = (rng.uniform(size=(DRAWN, 2)) - 0.5) * size / camera.focal_px
-        rays = np.column_stack([flat, np.ones(DRAWN)]) @ rotation
+        flat = (rng.uniform(size=(DRAWN_POINTS, 2)) - 0.5) * size / camera.focal_px
+        rays = np.column_stack([flat, np.ones(DRAWN_POINTS)]) @ rotation
         height = float(centre[2]) - flight.ground
-        rays = rays[-rays[:, 2] * FURTHEST > np.linalg.norm(rays, axis=1)]
+        rays = rays[-rays[:, 2] * MAX_DISTANCE_RATIO > np.linalg.norm(rays, axis=1)]
         found.append(centre + height * rays / -rays[:, 2:])
     points = np.concatenate(found)
     points[:, 2] += RELIEF_SHARE * float(np.median(flight.heights)) * rng.normal(size=len(points))
@@ -375,7 +375,7 @@ def _pixels(flight: _Flight, photo: int, points: Float64[np.ndarray, "p 3"]) -> 
     """Where a photo shows points; NaN where it does not."""
     camera, away = flight.cameras[photo], points - flight.centres[photo]
     rays = away @ flight.rotations[photo].T
-    near = (rays[:, 2] > 0.0) & (np.linalg.norm(away, axis=1) < FURTHEST * float(flight.heights[photo]))
+    near = (rays[:, 2] > 0.0) & (np.linalg.norm(away, axis=1) < MAX_DISTANCE_RATIO * float(flight.heights[photo]))
     size = np.array([camera.width, camera.height], dtype=np.float64)
     pixels = 0.5 * size + camera.focal_px * rays[:, :2] / np.where(near, rays[:, 2], 1.0)[:, None]
     inside = near & (pixels > 0.0).all(axis=1) & (pixels < size).all(axis=1)

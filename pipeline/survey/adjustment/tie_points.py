@@ -22,8 +22,8 @@ PER_CELL = 2
 MIN_VIEWS = 2
 MIN_SIGMA_PX = 1.0  # least sigma of tie points: the errors of a lens and of matching are shared by neighbours
 CELLS = 5  # a side, of the grid in which a photo's errors are averaged
-SETTLING = 6  # rounds for points that start from where their rays meet
-NEAR_PARALLEL = 1e-7  # least ratio of the eigenvalues of a point's rays
+TRIANGULATION_ROUNDS = 6  # rounds for points that start from where their rays meet
+MIN_EIGENVALUE_RATIO = 1e-7  # least ratio of the eigenvalues of a point's rays
 
 
 @dataclass(frozen=True)
@@ -177,10 +177,10 @@ def intersected(block: Block) -> Block:
     np.add.at(whole, block.point, across)
     np.add.at(side, block.point, np.einsum("mij,mj->mi", across, block.centres[block.photo]))
     values = np.linalg.eigvalsh(whole)
-    meet = values[:, 0] > NEAR_PARALLEL * np.maximum(values[:, 2], 1e-300)
+    meet = values[:, 0] > MIN_EIGENVALUE_RATIO * np.maximum(values[:, 2], 1e-300)
     points = block.points.copy()
     points[meet] = np.linalg.solve(whole[meet], side[meet][:, :, None])[:, :, 0]
-    return settle_points(replace(block, points=points), SETTLING)
+    return settle_points(replace(block, points=points), TRIANGULATION_ROUNDS)
 
 
 def image_errors(block: Block) -> Float64[np.ndarray, "m 2"]:

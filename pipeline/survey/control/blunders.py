@@ -33,12 +33,12 @@ from splatpipe.pipeline.survey.points.surveyed_points import Survey
 DATUM_M = 20.0  # a larger height offset from the positions (and DATUM_SIGMAS) means another datum
 DATUM_SIGMAS = 5.0
 EXACT_M = 0.5  # sigma of positions that also tell a pole's length and another base station
-EXACT_DATUM_M = 0.3  # least offset from them that is worth a word
+EXACT_DATUM_M = 0.3  # least offset from such positions that is worth a warning
 POLES_M = (1.0, 3.0)  # lengths of poles
 DATUMS_APART_M = 150.0  # in height: geoids lie within 110 m of the ellipsoid, and barometers err by less
 GEOID_BOUNDS_M = (-110.0, 90.0)  # heights of geoids above the ellipsoid, lowest and highest
 SWAPPED_SHARE = 0.3  # largest share of two points' errors that remains if swapping their names explains them
-WEAK = 4.0  # model uncertainty over the control's own accuracy that is worth a warning
+WEAK_RATIO = 4.0  # model uncertainty over the control's own accuracy that is worth a warning
 MIN_GSD = 3.0  # errors below this many ground pixels are not worth a message
 CONTROL_HINT = "--set georef.control=none runs without control."
 
@@ -211,7 +211,7 @@ def warn_of_weak_control(fit: JointFit, observed: JointObservations, model: Spar
     worth = noise * float(np.median(control[np.isfinite(control)]))
     measured = np.isfinite(control).any(axis=0)
     known = noise * float(np.median(fit.sigmas_at(model.points)[:, measured].max(axis=1)))
-    if known > WEAK * worth:
+    if known > WEAK_RATIO * worth:
         report.warning(
             f"Away from its points, the control determines the model's position only to {known:.2f} m.",
             "Add control points spread over the site, not along one line.",

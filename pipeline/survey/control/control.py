@@ -66,13 +66,13 @@ from splatpipe.pipeline.survey.points.surveyed_points import Survey
 from splatpipe.pipeline.survey.targets.target_survey import FoundBars
 
 MIN_DEFORMATION_PX = 0.5  # RMS shift in the images; if control deforms the model by less, it is not adjusted
-QUIET = 2.0  # times the stated sigmas; control with residuals up to this keeps its sigmas
-MISTAKEN = 100.0  # times the stated sigmas: no receiver, but mistakes; hand-held ones reach some 50 times 2 cm
-STRAY = 0.1  # relative deviation of a focal length from its prior that is worth a warning
-SUSPICIOUS = 1.0  # noise over sigmas; sound control with realistic sigmas stays well below
+MAX_QUIET_SIGMAS = 2.0  # residual over the stated sigmas up to which control keeps its sigmas
+MISTAKEN_SIGMAS = 100.0  # over the stated sigmas: no receiver, but mistakes; hand-held ones reach some 50 times 2 cm
+MAX_FOCAL_DEVIATION = 0.1  # relative deviation of a focal length from its prior that is worth a warning
+SUSPICIOUS_SIGMAS = 1.0  # noise over sigmas; sound control with realistic sigmas stays well below
 SINGLE_BLUNDER_GAIN = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
 MANY_OFF_SIGMAS = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
-SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
+MAX_SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
 MAX_ROUNDS = 4  # adjustments, each without a blunder found in the one before, or with larger sigmas
 
 
@@ -132,7 +132,7 @@ def place_by_control(
     geodetic = require_near(survey, config, stations)
     fitted = fit_control(survey, geodetic, stations, (model, capture.positions, frame), config, report)
     site, survey, start, observed, fit = fitted.site, fitted.survey, fitted.start, fitted.observed, fitted.fit
-    factor = fit.noise if fit.noise > QUIET else 1.0
+    factor = fit.noise if fit.noise > MAX_QUIET_SIGMAS else 1.0
     tell_heights_apart(fit, survey, stations, report)
     warn_of_weak_control(fit, observed, model, report)
     placed = GeoreferencedModel(model, fit.similarity, fit.offsets)
@@ -195,9 +195,9 @@ def _adjust_until_consistent(case: _Case, report: Reporter) -> _TrustedAdjustmen
     """Adjust until the control agrees, leaving out single blunders or else enlarging the sigmas."""
     best = _try(case.result.survey, 1.0, case)
     for _ in range(MAX_ROUNDS):
-        better = _without_one(best, case) if best.noise > SUSPICIOUS else None
+        better = _without_one(best, case) if best.noise > SUSPICIOUS_SIGMAS else None
         if better is None:
-            if best.noise <= QUIET:
+            if best.noise <= MAX_QUIET_SIGMAS:
                 break
             best = _try(best.survey, best.factor * best.noise, case)
             continue
@@ -228,7 +228,7 @@ def _without_one(trusted: _TrustedAdjustment, case: _Case) -> tuple[int, float, 
     chosen = _chosen(trusted.survey)
     if len(chosen) <= MIN_CONTROL or float(np.median(trusted.done.normed)) > MANY_OFF_SIGMAS:
         return None
-    for worst in np.argsort(-trusted.done.normed, kind="stable")[:SUSPECTS].tolist():
+    for worst in np.argsort(-trusted.done.normed, kind="stable")[:MAX_SUSPECTS].tolist():
         index = chosen[worst]
         points = list(trusted.survey.points)
         points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
@@ -261,7 +261,7 @@ def _adjusted(
         )
         return replace(result, survey=survey)
     if factor > 1.0:
-        far = factor > MISTAKEN
+        far = factor > MISTAKEN_SIGMAS
         worth = factor * float(np.median(result.site.targets.sigmas[_chosen(survey), 0]))
         report.warning(
             f"The control points agree with each other and the photos to {worth:.2f} m only, {factor:.1f} times what"
@@ -306,7 +306,7 @@ def _warn_of_focal_lengths(done: ControlAdjustment, capture: GeorefInput, report
                 " it stays within 3 % of the value in the metadata.",
                 "Add control at another height, or oblique photos, for reliable heights.",
             )
-        elif prior is not None and abs(camera.mean_focal_length() / prior - 1.0) > STRAY:
+        elif prior is not None and abs(camera.mean_focal_length() / prior - 1.0) > MAX_FOCAL_DEVIATION:
             report.warning(
                 f"Control takes the focal length from {prior:.0f} to {camera.mean_focal_length():.0f} pixels,"
                 " more than 10 % from the value in the metadata.",

@@ -15,10 +15,10 @@ from splatpipe.pipeline.survey.crs.crs import Crs, parse_crs, utm_of
 from splatpipe.pipeline.survey.crs.geodesy import ecef_from_geodetic
 from splatpipe.pipeline.survey.crs.readings import MAX_STATED_RATIO, MIN_WITNESSES, Evidence, Reading, plausible
 
-FAR_M = 2000.0  # from the photos; control that they show must be nearer
+FAR_M = 2000.0  # distance from the photos from which control cannot be what they show
 ZONE = 1e6  # what a zone number in front of an easting counts
 FOOT_M = 0.3048  # the US survey foot differs by 2e-6, which no position this far off can tell
-CUT = 1e5  # leading digits from here on are sometimes dropped for brevity
+CUT_FROM = 1e5  # leading digits from here on are sometimes dropped for brevity
 MAX_MISFIT_SHARE = 0.05  # how far a point may be off the shape of the others, over the points' extent
 MAX_SCALE_RATIO = 1.2  # factor between the model's scales by its positions and by a reading, at most
 MAX_TURN_RAD = np.radians(20.0)  # angle between the model's headings by both, at most
@@ -101,7 +101,7 @@ def _rewritten(stated: Plane, crs: Crs, place: Float64[np.ndarray, " 3"] | None)
             transformer = pyproj.Transformer.from_crs("EPSG:4979", crs.horizontal, always_xy=True)
             there = np.array(transformer.transform(place[1], place[0], 0.0)[:2])
             middle = np.median(xy, axis=0)
-            missing = np.round((there - middle) / CUT) * CUT
+            missing = np.round((there - middle) / CUT_FROM) * CUT_FROM
             if np.isfinite(missing).all() and (np.abs(xy) < np.abs(there)).all():
                 digits = f"with the leading digits that they lack ({missing[0]:+,.0f} and {missing[1]:+,.0f})"
                 yield as_(digits, xy + missing)

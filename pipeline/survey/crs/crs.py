@@ -60,7 +60,7 @@ __all__ = [
 
 WGS84_3D = "EPSG:4979"
 MAX_OUTSIDE_KM = 300.0  # distance from a CRS's area of use: surveyors do stay in their zone across a border
-STRETCH = 0.05  # a projected length that differs more from the true one belongs to another part of the earth
+MAX_STRETCH = 0.05  # a projected length that differs more from the true one belongs to another part of the earth
 AROUND_DEG = 0.05  # around the points: where operations are compared
 MAX_ROUNDS = 10  # iterations to the exact inverse; each gains four digits
 TOLERANCE_M = 1e-6  # change at which the iteration ends: float64 resolves 1e-9 m at a northing of 5,000 km
@@ -284,7 +284,7 @@ def _require_near(crs: Crs, latitude: float, longitude: float, most_km: float = 
     elif not crs.is_geographic:
         factors = pyproj.Proj(crs.horizontal).get_factors(longitude, latitude)
         stretch = max(abs(factors.meridional_scale - 1.0), abs(factors.parallel_scale - 1.0))
-        if not stretch <= STRETCH:  # also where it is infinite or not a number
+        if not stretch <= MAX_STRETCH:  # also where it is infinite or not a number
             raise SplatpipeError(
                 f"{place} is in another part of the earth, where {crs.text} is not true to scale.", hint
             )

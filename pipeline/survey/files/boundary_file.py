@@ -20,11 +20,11 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.geometry.plan_area import Polygon, Ring, signed_area
 
-LARGEST_FILE = 8 << 20  # bytes: a hundred times the size of a detailed outline
+MAX_FILE_BYTES = 8 << 20  # bytes: a hundred times the size of a detailed outline
 MAX_VERTICES = 20_000  # in all rings: finer than any drawn or measured boundary
-DEEPEST = 8  # nested collections
-LONGEST_NAME = 80  # characters of a feature's name that fit a label
-LARGEST = 1e9  # absolute coordinate; no CRS of the earth has larger ones
+MAX_NESTING = 8  # nested collections
+MAX_NAME_CHARACTERS = 80  # characters of a feature's name that fit a label
+MAX_COORDINATE = 1e9  # absolute coordinate; no CRS of the earth has larger ones
 EXPECTED = "Draw it as a polygon in QGIS or geojson.io, and save it as GeoJSON."
 WGS84 = "EPSG:4326"
 Vertex = Float64[np.ndarray, " 2"]
@@ -89,7 +89,7 @@ class _BrokenError(ValueError):
 
 def _value(path: Path) -> dict[str, Any]:
     try:
-        value = json.loads(read_small(path, LARGEST_FILE).decode("utf-8-sig"), parse_constant=_no_number)
+        value = json.loads(read_small(path, MAX_FILE_BYTES).decode("utf-8-sig"), parse_constant=_no_number)
     except OSError as error:
         raise SplatpipeError(f"The boundary {path.name} cannot be read: {error.strerror}.", EXPECTED) from error
     except (ValueError, RecursionError) as error:  # not text, not JSON, a number of a million digits, deep nesting
@@ -105,8 +105,8 @@ def _no_number(text: str) -> float:
 
 def _geometries(value: Any, depth: int, name: str) -> Iterator[tuple[dict[str, Any], str]]:
     """Yield the geometries in an object, with collections flattened, each with its feature's name."""
-    if depth > DEEPEST:
-        raise _BrokenError(f"has collections within collections, more than {DEEPEST} deep")
+    if depth > MAX_NESTING:
+        raise _BrokenError(f"has collections within collections, more than {MAX_NESTING} deep")
     kind = value.get("type") if isinstance(value, dict) else None
     if kind == "FeatureCollection":
         parts = value.get("features")
@@ -130,7 +130,7 @@ def _name(properties: Any) -> str:
     """Return a feature's name as one line of valid text."""
     stated = properties.get("name") if isinstance(properties, dict) else None
     text = " ".join(stated.split()) if isinstance(stated, str) else ""
-    return text[:LONGEST_NAME].encode("utf-8", "replace").decode("utf-8")  # JSON may contain lone surrogates
+    return text[:MAX_NAME_CHARACTERS].encode("utf-8", "replace").decode("utf-8")  # JSON may contain lone surrogates
 
 
 def _polygons(geometries: list[tuple[dict[str, Any], str]]) -> Iterator[tuple[Polygon, str]]:
@@ -168,7 +168,7 @@ def _ring(stated: list[Any]) -> Ring:
 def _position(stated: Any) -> tuple[float, float]:
     numbers = _listed(stated)[:2]
     for number in numbers:
-        if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) <= LARGEST:
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) <= MAX_COORDINATE:
             raise _BrokenError("has a coordinate that is out of range")
     if len(numbers) < 2:
         raise _BrokenError("has a position without two coordinates")

@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.survey.files.control_file import (
     COLUMNS,
-    TABS,
+    MIN_TABS,
     SurveyedPoint,
     Table,
     fields_of,
@@ -171,7 +171,7 @@ class ControlText:
             fields = fields_of(line, self.table.separator)
             fields[3:5] = pixel_fields
             fields[5] = fields[5] if keep else photo
-            return _joined(fields, self.table.separator, tabs=line.count("\t") >= TABS)
+            return _joined(fields, self.table.separator, tabs=line.count("\t") >= MIN_TABS)
         delimiter, columns = self._columns()
         cells = cells_of(line, delimiter)
         cells += [""] * (max(columns.values()) + 1 - len(cells))

@@ -44,7 +44,7 @@ Role = Literal["control", "check"]
 MAX_POINTS = 10_000
 MAX_NAME = 255
 UNNAMED = "point "  # before the number of a point without a name
-TABS = 5  # a line of ODM's list with at least as many is tab-separated
+MIN_TABS = 5  # a line of ODM's list with at least as many is tab-separated
 SAME_PLACE_M = 1e-3  # lines of one point must repeat its coordinates to within a millimetre
 SEA_LEVEL_M = 20.0  # a height of exactly 0 counts as measured if another point is this close to 0, else as unknown
 SIGMA_BOUNDS_M = (1e-4, 1e3)
@@ -293,8 +293,8 @@ def _odm_rows(written: Sequence[tuple[int, str]]) -> tuple[str, list[Row], str]:
 
 def fields_of(line: str, separator: str) -> list[str]:
     """The fields of a line of ODM's list; a photo's name with blanks is one of them, up to its suffix."""
-    fields = list_fields(line, separator, TABS)
-    return fields if separator or line.count("\t") >= TABS else with_whole_name(fields, 5)
+    fields = list_fields(line, separator, MIN_TABS)
+    return fields if separator or line.count("\t") >= MIN_TABS else with_whole_name(fields, 5)
 
 
 def _require_no_points(written: Sequence[tuple[int, str]]) -> None:
@@ -304,7 +304,7 @@ def _require_no_points(written: Sequence[tuple[int, str]]) -> None:
         LineError: if the lines are such points.
     """
     for separator in filter(None, SEPARATORS):
-        looked = [list_fields(line, separator, TABS) for _, line in written[:SAMPLE_LINES]]
+        looked = [list_fields(line, separator, MIN_TABS) for _, line in written[:SAMPLE_LINES]]
         points = [each for each in looked if len(each) >= 4 and all(map(is_numeral, each[1:4]))]
         if points and 2 * len(points) >= len(looked) and not any(is_photo(PurePosixPath(cell)) for cell in points[0]):
             what = f"points separated by {SEPARATORS[separator]} without titles"

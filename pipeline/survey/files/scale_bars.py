@@ -31,7 +31,7 @@ MAX_NAME = 255
 LENGTH_BOUNDS_M = (1e-3, 1e5)
 SIGMA_BOUNDS_M = (1e-6, 1e3)
 DEFAULT_SIGMA_M = 0.001  # sigma of a bar whose file states none: a folding rule's
-WORST_AGREEMENT = 0.05  # relative deviation from the bars' median above which a bar is left out
+MAX_DEVIATION = 0.05  # relative deviation from the bars' median above which a bar is left out
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "a": ("name_a", "a", "from", "target_a", "marker_a", "start"),
     "b": ("name_b", "b", "to", "target_b", "marker_b", "end"),
@@ -145,7 +145,7 @@ def scale_by(bars: Sequence[ScaleBar], places: Mapping[str, Float64[np.ndarray, 
         return None
     ratio, sigma = np.array(ratios), np.array(sigmas)
     middle = float(np.median(ratio))
-    good = np.abs(ratio / middle - 1.0) <= np.maximum(WORST_AGREEMENT, 3.0 * sigma)
+    good = np.abs(ratio / middle - 1.0) <= np.maximum(MAX_DEVIATION, 3.0 * sigma)
     if not good.any():  # two that contradict each other
         return None
     weight = np.where(good, sigma**-2.0, 0.0)

@@ -24,10 +24,10 @@ MIN_POSITIONS = 3
 MAX_SIGMA_SCALE = 0.2  # a less certain scale is unusable
 MAX_SIGMA_ROTATION_RAD = math.radians(15.0)  # a direction known no better is unusable
 DOUBTFUL_UP_RAD = math.radians(2.5)  # where errors drift, an up direction less certain than this may be wrong
-CONTRADICTION = 2.0  # joint sigmas between the positions' directions and those of the cameras
-SLOW = 0.5  # correlation above which the stated accuracy depends on how errors drift
-OUTLIER_NOISES = 6.0  # times the noise of all positions
-OUTLIER_SIGMAS = 3.0  # times the stated sigma: a smaller error is not an outlier
+CONTRADICTION_SIGMAS = 2.0  # joint sigmas between the positions' directions and those of the cameras
+SLOW_CORRELATION = 0.5  # correlation above which the stated accuracy depends on how errors drift
+OUTLIER_NOISES = 6.0  # error of an outlier over the noise of all positions
+OUTLIER_SIGMAS = 3.0  # error over the stated sigma up to which it is not an outlier
 ROUNDS = 4
 MAX_LOG_SCALE_CHANGE = math.log(1.5)  # from the robust fit: noise of half of that cannot change it by more
 
@@ -160,8 +160,8 @@ def _fitted(
     weakest = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
     off, ratio = _contradiction(alone, directions)
     doubtful = math.sqrt(float(np.trace(covariance[:2, :2]))) > DOUBTFUL_UP_RAD
-    drifting = doubtful and float(alone.noise.correlations.max()) > SLOW
-    contradicted = drifting and ratio > CONTRADICTION
+    drifting = doubtful and float(alone.noise.correlations.max()) > SLOW_CORRELATION
+    contradicted = drifting and ratio > CONTRADICTION_SIGMAS
     wanted = directions.prior.sigma_rad if directions.of_gimbal else MAX_SIGMA_ROTATION_RAD
     with_prior = drifting or weakest > wanted
     noisy = alone

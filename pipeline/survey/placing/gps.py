@@ -45,7 +45,7 @@ from splatpipe.pipeline.survey.placing.up_witnesses import UpVerdict, check_up
 
 ORIGIN_DIGITS = 5  # degrees: about a metre, so that the origin stays put when a few photos are added or removed
 SWAPPED_NOISE_RATIO = 0.5  # noise with swapped coordinates over that as stated, below which they are swapped
-POOR_NOISES = 2.0  # times the stated sigmas: worth a warning
+POOR_NOISES = 2.0  # noise over the stated sigmas that is worth a warning
 LINE_RAD = math.radians(60.0)  # if the rotation about an axis is no better determined, positions lie along that axis
 NADIR_PITCH_DEG = -60.0
 MAX_HEIGHT_DEVIATION = 0.1  # relative difference from the drone's height above ground that is worth a warning

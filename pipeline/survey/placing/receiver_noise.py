@@ -15,7 +15,12 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.alignment import MEDIAN_OF_CHI3
-from splatpipe.pipeline.geometry.correspondences import MIN_NOISE_FACTOR, REDUNDANT, Correspondences, DirectionPrior
+from splatpipe.pipeline.geometry.correspondences import (
+    MIN_NOISE_FACTOR,
+    MIN_REDUNDANT_POINTS,
+    Correspondences,
+    DirectionPrior,
+)
 from splatpipe.pipeline.geometry.similarity import (
     SIMILARITY,
     Similarity,
@@ -26,7 +31,7 @@ from splatpipe.pipeline.geometry.similarity import (
 )
 
 CORRELATIONS = np.array([*np.arange(0.0, 0.9, 0.05), 0.9, 0.925, 0.95, 0.97, 0.98, 0.99])
-UNPROVEN = 2.0  # least gain in minus twice the log-likelihood for a correlation to be accepted (Akaike 1974)
+MIN_LIKELIHOOD_GAIN = 2.0  # least gain in minus twice the log-likelihood for a correlation to be accepted (Akaike 1974)
 GROUP_OF_AXIS = np.array([0, 0, 1])  # east, north; up
 TRANSLATION = np.arange(4, SIMILARITY)  # translation among the unknowns of the similarity
 MAX_ROUNDS = 40
@@ -156,7 +161,7 @@ def _with_covariance(
     prior: DirectionPrior | None,
 ) -> NoisyFit:
     """The fit with its covariance, computed with a lower limit on the noise, since slow errors hide part of it."""
-    least = MIN_NOISE_FACTOR if len(points) >= REDUNDANT else 1.0
+    least = MIN_NOISE_FACTOR if len(points) >= MIN_REDUNDANT_POINTS else 1.0
     cautious = ReceiverNoise(np.maximum(noise.factors, least), noise.correlations, noise.degrees)
     whitened = _whitened(_rows(points, before, similarity, offsets), cautious)[:, :-1]
     information = whitened.T @ whitened + _held(points, similarity, prior)
@@ -269,7 +274,7 @@ def _grouped(rows: _ResidualRows, group: int) -> _Group:
 
 def _tried(noise: ReceiverNoise, count: int, done: int) -> list[Float64[np.ndarray, " _"]]:
     """The correlations to try in a round, for each group; a few points do not determine them."""
-    if count < REDUNDANT:
+    if count < MIN_REDUNDANT_POINTS:
         return [CORRELATIONS[:1]] * 2
     if done < SEARCHED_ROUNDS:
         return [CORRELATIONS] * 2
@@ -287,7 +292,7 @@ def _reml(
         other = 1 - group
         rest = held + groups[other].products(correlations[other : other + 1])[0, :-1, :-1] / factors[other] ** 2
         found, free, costs = _profile(groups[group], tried[group], rest, float(factors[group]))
-        best = int(np.argmin(costs + np.where(tried[group] > 0.0, UNPROVEN, 0.0)))
+        best = int(np.argmin(costs + np.where(tried[group] > 0.0, MIN_LIKELIHOOD_GAIN, 0.0)))
         factors[group], correlations[group] = found[best], tried[group][best]
         squared = float(correlations[group]) ** 2
         degrees[group] = max(1.0, float(free[best]) * (1.0 - squared) / (1.0 + squared))

@@ -36,7 +36,7 @@ FLYING_M = 5.0  # above take-off: the ground is below, whatever is being photogr
 ABOVE_SHARE = 0.95  # share of points above flying cameras that shows a model upside down: no ground is among them
 MIN_VERTICAL_PART = 0.9  # vertical part of the mean view for photos from above; less where the views differ
 FLYING = "the direction of flight against the headings"
-STOPPING = 2  # witnesses against a placement
+STOPPING_WITNESSES = 2  # witnesses against a placement with which it stops
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class UpVerdict:
     @property
     def doubtful(self) -> bool:
         """Whether a contradiction is not outvoted."""
-        return bool(self.against) and (self.refuted or self.confirming < STOPPING)
+        return bool(self.against) and (self.refuted or self.confirming < STOPPING_WITNESSES)
 
     def sentence(self) -> str:
         """What contradicts, a clause."""
@@ -93,7 +93,7 @@ def check_up(placed: Similarity, model: SparseModel, positions: Positions, photo
     against = [witness for witness in witnesses if witness.against]
     confirming = len(witnesses) - len(against)
     independent = any(not witness.of_gimbal for witness in against) or confirming == 0
-    refuted = len(against) >= STOPPING and len(against) > confirming and independent
+    refuted = len(against) >= STOPPING_WITNESSES and len(against) > confirming and independent
     return UpVerdict(tuple(witness.what for witness in against), confirming, refuted)
 
 

@@ -16,7 +16,7 @@ from splatpipe.pipeline.survey.plausibility.barometer import altitude_climbs
 from splatpipe.pipeline.survey.positions.photo_positions import DATUM_STEP_M, PositionList
 from splatpipe.pipeline.survey.positions.position_sources import MOST_DATUMS_M
 
-ALTITUDE_SPREADS = 8.0  # times the median deviation from the median altitude
+ALTITUDE_SPREADS = 8.0  # deviation from the median altitude over the median deviation, for an altitude to be wrong
 MIN_ALTITUDE_M = 150.0  # off the others: more than a building and its hill
 FILE_STEP_M = 20.0  # between altitudes of a file and the photos' own: a drone's own are off by nearly as much
 

@@ -19,7 +19,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.files.photo_list import Photo
 from splatpipe.pipeline.survey.control.blunders import EXACT_M
-from splatpipe.pipeline.survey.control.control import MISTAKEN, ControlResult
+from splatpipe.pipeline.survey.control.control import MISTAKEN_SIGMAS, ControlResult
 from splatpipe.pipeline.survey.crs.crs import Crs, outside_area_km, parse_crs
 from splatpipe.pipeline.survey.crs.frames import Frame
 from splatpipe.pipeline.survey.placing.level import Positions, gimbal_rotation
@@ -40,7 +40,7 @@ MIN_WITNESSES = 6
 ODD_SHARE = 0.4  # share of the positions that are odd, above which the others may be the wrong ones
 CLOCK_S = 1.0  # EXIF's times are whole seconds
 DRONE_M_S, AIRCRAFT_M_S = 50.0, 150.0  # no survey is flown faster: drones, and manned aircraft (or unknown)
-OUTSIDE_KM = 100.0  # from the CRS's area of use: surveyors stay in their zone across a border
+OUTSIDE_KM = 100.0  # distance from the CRS's area of use, at most: surveyors stay in their zone across a border
 DATUM_M, DATUM_SIGMAS = 20.0, 5.0  # control off the positions: more is another datum or CRS
 MAX_MISFIT_SHARE = 0.05  # misfit over the control's width: tape and hand-held receivers do better, or say so
 BASE_M = 3.0  # control off positions stated to EXACT_M: modern datums differ by less, wrong bases and points by more
@@ -312,7 +312,7 @@ def _control(placed: Placed) -> Iterator[Contradiction]:
 def _agreement(placed: Placed) -> Iterator[Contradiction]:
     """Control whose points lie off each other by a good part of the site: they do not have the model's shape."""
     controlled = placed.controlled
-    if controlled is None or controlled.sigma_factor <= MISTAKEN:
+    if controlled is None or controlled.sigma_factor <= MISTAKEN_SIGMAS:
         return
     chosen = [k for k, point in enumerate(controlled.survey.points) if point.role == "control"]
     targets = controlled.site.targets

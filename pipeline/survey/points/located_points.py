@@ -14,9 +14,9 @@ from splatpipe.pipeline.photos.files.photo_list import Photo
 from splatpipe.pipeline.survey.files.control_file import SurveyedPoint
 from splatpipe.pipeline.survey.placing.model import SparseModel
 
-MARK_TOLERANCE = 10.0  # times the marks' sigma
+MAX_MARK_SIGMAS = 10.0  # error of a mark over the marks' sigma, at most
 MIN_TOLERANCE_PX = 5.0  # least error of a mark to be wrong: SfM's own errors at the edge of a photo
-FIT_TOLERANCE = 8.0  # times the model's mean reprojection error
+MAX_ERROR_RATIO = 8.0  # error of a mark over the model's mean reprojection error, at most
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def locate(point: SurveyPoint, model: SparseModel, photos: Mapping[str, Photo], 
         return point.left_out(_why_unseen(point, len(placed)))
     rays, error_px = _rays([point.sightings[k] for k in placed], model, photos)
     good = np.isfinite(rays.rays).all(axis=1) & np.isfinite(rays.pixels).all(axis=(1, 2))
-    tolerance = max(MIN_TOLERANCE_PX, MARK_TOLERANCE * mark_sigma_px, FIT_TOLERANCE * error_px)
+    tolerance = max(MIN_TOLERANCE_PX, MAX_MARK_SIGMAS * mark_sigma_px, MAX_ERROR_RATIO * error_px)
     found = triangulate(rays.only(good), tolerance) if good.sum() >= 2 else None
     if found is None:
         many = "two marks" if len(placed) == 2 else f"{len(placed)} marks"

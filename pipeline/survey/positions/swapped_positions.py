@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.sfm.pairing.pairs import Pair
 
-FURTHEST = 4.0  # times the usual distance of photos that match: a false match must not outweigh all others
+MAX_DISTANCE_RATIO = 4.0  # over the usual distance of photos that match: a false match must not outweigh all others
 MIN_PARTNERS = 3  # that each of the two matches
 MIN_NEARER = 0.02  # reduction of two photos' distances to their partners, relative; right ones give 0.003 at most
 CLEARLY_NEARER = 0.08  # where no times give the path
@@ -96,7 +96,7 @@ def _nearer(places: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, "n 
     if not (weights > 0.0).any():
         return np.zeros_like(weights)
     usual = max(float(np.median(distances[weights > 0.0])), 1e-6)
-    distances = np.minimum(distances / usual, FURTHEST)
+    distances = np.minimum(distances / usual, MAX_DISTANCE_RATIO)
     own = (weights * distances).sum(axis=1)
     now = own[:, None] + own[None, :]
     there = weights @ distances  # [a, b]: photo a at the position of b

@@ -18,9 +18,9 @@ RESIDUALS = 4.0  # tolerance over the median residual
 MIN_MATCHES = 3  # fewer places may match points by chance
 MAX_HYPOTHESES = 2000
 MAX_TRIPLES = 500  # triples of known pairs, as hypotheses
-ROUNDS = 5
-FLAT = 0.1  # second over longest extent; points nearly on a line do not determine a tilt
-WRONG = 3.0  # times the tolerance: beyond it, a place known by its number belongs to another point
+MAX_ROUNDS = 5
+MIN_EXTENT_RATIO = 0.1  # second over longest extent; points nearly on a line do not determine a tilt
+WRONG_RATIO = 3.0  # distance over the tolerance beyond which a place known by its number belongs to another point
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def overlay(
         start = Similarity(1.0, np.eye(3), moved)
     tolerance = TOLERANCE_M
     current, pairs = start, np.zeros((0, 2), dtype=np.int64)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         pairs, residuals = _assigned(current.apply(places), points, tolerance)
         if len(pairs) < MIN_MATCHES:
             return None
@@ -165,4 +165,4 @@ def _spread(source: Float64[np.ndarray, "k 3"], whole: Bool[np.ndarray, " k"]) -
     if whole.sum() < MIN_MATCHES:
         return False
     extents = np.linalg.svd(source[whole] - source[whole].mean(axis=0), compute_uv=False)
-    return bool(extents[1] > FLAT * extents[0])
+    return bool(extents[1] > MIN_EXTENT_RATIO * extents[0])

@@ -19,7 +19,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.files.photo_list import Photo
 from splatpipe.pipeline.survey.placing.model import SparseModel
-from splatpipe.pipeline.survey.targets.constellation import MIN_MATCHES, WRONG, overlay
+from splatpipe.pipeline.survey.targets.constellation import MIN_MATCHES, WRONG_RATIO, overlay
 from splatpipe.pipeline.survey.targets.target_finds import TargetFind
 from splatpipe.pipeline.survey.targets.target_tracks import Track, coded_tracks, unnamed_tracks
 
@@ -129,7 +129,7 @@ def _by_place(
     if found is None:
         return {}, set()
     there = found.points_from_places.apply(places)
-    limit = WRONG * found.tolerance_m
+    limit = WRONG_RATIO * found.tolerance_m
     off = {name: expected.enu[row[name]] - there[k] for k, name in enumerate(known)}
     wrong = {each.name for each in by_number if each.name in off and np.nansum(off[each.name] ** 2) > limit**2}
     taken = set(known)

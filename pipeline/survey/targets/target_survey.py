@@ -23,7 +23,7 @@ from splatpipe.pipeline.survey.targets.expected_places import expected_enu, free
 from splatpipe.pipeline.survey.targets.target_finds import TargetFind, WantedTargets
 from splatpipe.pipeline.survey.targets.target_marks import ExpectedPoints, TargetMarks, named_tracks
 
-SCALE_OFF = 3.0  # joint sigmas between the bars' scale and the frame's: worth a warning
+SCALE_OFF_SIGMAS = 3.0  # joint sigmas between the bars' scale and the frame's: worth a warning
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def compare(frame: Frame, scale: ModelScale, report: Reporter, adjusted: bool = 
     what = f"According to {bars}, lengths in this result are {ratio:+.3%} off."
     if adjusted:
         what = f"After the adjustment, which {bars} took part in, lengths are {ratio:+.3%} off theirs."
-    if abs(ratio) > SCALE_OFF * scale.sigma + 0.01:
+    if abs(ratio) > SCALE_OFF_SIGMAS * scale.sigma + 0.01:
         report.warning(what, "Check the bars, and the coordinates or positions that set the scale.")
     else:
         report.note(what)

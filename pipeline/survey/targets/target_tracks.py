@@ -15,12 +15,12 @@ from splatpipe.pipeline.survey.placing.model import SparseModel
 from splatpipe.pipeline.survey.targets.target_finds import TargetFind
 
 MIN_TOLERANCE_PX = 3.0
-FIT_TOLERANCE = 4.0  # times the model's mean reprojection error
+MAX_ERROR_RATIO = 4.0  # error of a sighting over the model's mean reprojection error, at most
 MIN_UNNAMED = 3  # photos of a target without a number: two rays can meet by chance
 MIN_CODED = 2
 MAX_PARTNERS = 40  # partners of a detection that are tried as hypotheses
 MAX_SEEDS = 4000
-BEYOND = 2.0  # factor by which a target may be farther or nearer than the sparse points in a photo
+DEPTH_MARGIN = 2.0  # factor by which a target may be farther or nearer than the sparse points in a photo
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ def _seen(finds: Sequence[TargetFind], model: SparseModel, photos: Mapping[str, 
     poses = np.stack([views[k].cam_from_model for k in good])
     error = model.reconstruction.compute_mean_reprojection_error() / min(views[k].scale for k in good)
     found = Rays(poses, np.stack([rays[k] for k in good]), np.stack([pixels[k] for k in good]))
-    return _PosedFinds(tuple(posed[k] for k in good), found, max(MIN_TOLERANCE_PX, FIT_TOLERANCE * float(error)))
+    return _PosedFinds(tuple(posed[k] for k in good), found, max(MIN_TOLERANCE_PX, MAX_ERROR_RATIO * float(error)))
 
 
 def _track(seen: _PosedFinds, least: int) -> Track | None:
@@ -130,7 +130,7 @@ def _reach(seen: _PosedFinds, model: SparseModel) -> Float64[np.ndarray, "n 2"]:
         pose = np.asarray(image.cam_from_world().matrix(), np.float64)
         depth = np.array(observed).reshape(-1, 3) @ pose[2, :3] + pose[2, 3]
         low, high = np.percentile(depth, [1.0, 99.0]) if len(depth) else (0.0, np.inf)
-        depths[name] = float(low) / BEYOND, float(high) * BEYOND
+        depths[name] = float(low) / DEPTH_MARGIN, float(high) * DEPTH_MARGIN
     return np.array([depths[find.photo] for find in seen.finds])
 
 

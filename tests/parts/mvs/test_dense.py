@@ -13,7 +13,7 @@ from tiny_scene import split_part, write_model
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.mvs.dense import WIDER, DensePoints, PointBudget, dense_points, thin_out
+from splatpipe.pipeline.mvs.dense import NEAR_MARGIN, DensePoints, PointBudget, dense_points, thin_out
 from splatpipe.pipeline.mvs.depth_search import confirm
 from splatpipe.pipeline.mvs.neighbours import SparseVisibility, inverse_depths, neighbours
 from splatpipe.pipeline.mvs.options import InitializeConfig
@@ -251,9 +251,9 @@ def test_neighbours_prefer_ten_degrees_and_skip_views_that_share_nothing() -> No
     near = neighbours(tracks, cameras, 8)
     assert near[0] == [2, 1, 3]
     assert near[4] == []
-    smallest, largest = inverse_depths(tracks, 0, cameras[0], WIDER) or (0.0, 0.0)
+    smallest, largest = inverse_depths(tracks, 0, cameras[0], NEAR_MARGIN) or (0.0, 0.0)
     assert 0.005 < smallest < 0.02 and 0.1 < largest < 0.2
-    assert inverse_depths(tracks, 4, cameras[4], WIDER) is None
+    assert inverse_depths(tracks, 4, cameras[4], NEAR_MARGIN) is None
 
 
 def test_a_voxel_without_a_sparse_point_keeps_its_most_certain_point() -> None:

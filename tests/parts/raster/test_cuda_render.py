@@ -10,9 +10,9 @@ from random_scene import random_scene
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.cuda.cuda_forecast import (
+    CAPACITY_MARGIN,
     FIRST_PASSES,
-    MARGIN,
-    WINDOW,
+    WINDOW_FRAMES,
     Forecast,
     FrameSize,
     most_pairs_of,
@@ -105,7 +105,7 @@ def test_forecast_keeps_the_recent_maximum_and_forgets_it():
         forecast.update(facts(pairs))
     assert 9000 < forecast.room(size).capacity < 1.5 * 9000
     assert forecast.room(size).passes == 1
-    for _ in range(2 * WINDOW):
+    for _ in range(2 * WINDOW_FRAMES):
         forecast.update(facts(4000))
     assert 4000 < forecast.room(size).capacity < 1.5 * 4000
 
@@ -121,6 +121,6 @@ def test_forecast_grows_with_the_model_and_the_picture_and_keeps_to_its_limit():
     assert forecast.room(FrameSize(1500, 400)).capacity > 1.5 * 8000
     larger = forecast.room(FrameSize(1000, 4000))
     assert larger.capacity == 20_000
-    assert larger.capacity * larger.passes > MARGIN * 10 * 8000  # one more: chunks end with a tile
+    assert larger.capacity * larger.passes > CAPACITY_MARGIN * 10 * 8000  # one more: chunks end with a tile
     assert forecast.room(FrameSize(50_000, 400)).capacity == 50_000  # any tile's pairs must fit
     assert forecast.room(FrameSize(10, 200_000)).passes > 3  # a chunk's tiles have 16 bits

@@ -10,7 +10,7 @@ from planted_seams import STRIP, colour_step, doubled, gap
 
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
-from splatpipe.pipeline.render.seams import KINDS, LIMITS, Seam, border_cameras, find_seams
+from splatpipe.pipeline.render.seams import KINDS, SEAM_LIMITS, Seam, border_cameras, find_seams
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 PLAN = GroundPlan.across(np.array([0.0, 0.0, 1.0]))
@@ -86,7 +86,7 @@ def test_step_of_colour_is_found_and_how_large(splat: Gaussians, coarse: Gaussia
     assert set(seams) == {"colour"}
     response = seams["colour"].response
     assert response.measure == "step" and abs(response.size / np.sqrt(3.0) - 0.05) < 0.02
-    assert response.score > 2.0 * LIMITS["step"][0]
+    assert response.score > 2.0 * SEAM_LIMITS["step"][0]
 
 
 def test_a_seam_on_part_of_a_border_is_located(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:
@@ -99,4 +99,4 @@ def test_a_seam_on_part_of_a_border_is_located(splat: Gaussians, coarse: Gaussia
 
 def test_border_through_empty_space_has_no_seam(splat: Gaussians, coarse: Gaussians, cameras: list[Camera]) -> None:
     assert found(splat, coarse, PlanLine((300.0, 0.0), (300.0, 20.0)), cameras) == {}
-    assert set(KINDS) == set(LIMITS)
+    assert set(KINDS) == set(SEAM_LIMITS)

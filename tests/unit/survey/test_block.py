@@ -205,7 +205,7 @@ def test_a_long_flight_is_judged_in_parts(
     monkeypatch: pytest.MonkeyPatch, flight: FlownBlock, fitted: BlockFit
 ) -> None:
 
-    monkeypatch.setattr("splatpipe.pipeline.survey.adjustment.position_adjustment.PART", 12)
+    monkeypatch.setattr("splatpipe.pipeline.survey.adjustment.position_adjustment.PART_POSITIONS", 12)
     parts = list(parts_of(fitted.adjusted, flight.positions))
     assert [int(part.chosen.sum()) for part in parts] == [12, 12]
     assert all(len(part.block) == 12 and len(part.system.gradient) == 36 for part in parts)

@@ -210,7 +210,7 @@ def test_an_invalid_boundary_is_refused_by_name_and_with_what_to_do(tmp_path: Pa
 def test_a_large_file_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "boundary.geojson"
     with path.open("wb") as file:
-        file.truncate(boundary_file.LARGEST_FILE + 1)
+        file.truncate(boundary_file.MAX_FILE_BYTES + 1)
     with pytest.raises(SplatpipeError, match="more than 8 MiB"):
         read_boundary(path)
 
@@ -239,7 +239,7 @@ def test_polygons_have_their_features_names(tmp_path: Path) -> None:
     named += [(one, {"name": half}), (one, {"name": long})]
     features = {"type": "FeatureCollection", "features": [feature(*pair) for pair in named]}
     names = read_boundary(written(tmp_path, features)).names
-    assert names == ("Heap A", "a b", "a b", "", "", "in", "?", "x" * boundary_file.LONGEST_NAME)
+    assert names == ("Heap A", "a b", "a b", "", "", "in", "?", "x" * boundary_file.MAX_NAME_CHARACTERS)
 
 
 def test_the_place_where_an_outline_crosses_itself_is_reported(tmp_path: Path) -> None:
