@@ -110,7 +110,7 @@ def test_nothing_else_writes_files() -> None:
     sources = [*(ROOT / "pipeline").rglob("*.py"), *(ROOT / "stages").glob("*.py")]
     found = {path.relative_to(ROOT).as_posix(): list(writes(path.read_text(encoding="utf-8"))) for path in sources}
     assert {name: calls for name, calls in found.items() if calls and name not in ALLOWED} == {}, (
-        "use engine.output_file or engine.durable"
+        "use engine.files.output_file or engine.files.durable"
     )
     assert [name for name in ALLOWED if not found[name]] == [], "these need no exception"
 
