@@ -18,6 +18,7 @@ from splatpipe.pipeline.geometry.correspondences import (
     SharedErrors,
     normed,
 )
+from splatpipe.pipeline.geometry.robust import CAUCHY
 from splatpipe.pipeline.geometry.similarity import (
     RANK_TOLERANCE,
     SIMILARITY,
@@ -46,7 +47,6 @@ LOCAL_ROUNDS = 5
 WEAK_ROTATION_RAD = math.radians(5.0)  # a rotation known less well than this uses the prior, if there is one
 IRLS_ROUNDS = 50
 IRLS_TOLERANCE = 1e-13  # size of a step at which iterations end: radians, and relative to the extent
-CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 MEDIAN_OF_CHI3 = math.sqrt(2.365974 / 3.0)  # median of sqrt(chi²_3 / 3)
 OUTLIER_NOISES = 8.0  # times the noise; Gaussian errors are never this large
 LIMIT_GROWTH = 1.5  # from one limit to the next where the noise has to be estimated

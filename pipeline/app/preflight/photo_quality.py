@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.app.preflight.findings import Finding
+from splatpipe.pipeline.geometry.robust import MAD_TO_SIGMA
 from splatpipe.pipeline.photos.files.names import list_names, printable
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures
@@ -16,7 +17,6 @@ from splatpipe.pipeline.sfm.recovery.refusal import texture_hint
 MAX_LOG_ENERGY_RATIO = 0.85  # log energy ratio: motion blur of 3 px gives at least 1.1, sharp photos at most 0.5
 MAX_LOG_ENERGY_SPREADS = 4.0  # times the usual deviation between photos, if a whole capture is blurred
 WHOLE_CAPTURE_SHARE = 0.08  # share of the photos above which it is reported once, for the whole capture
-MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation, for Gaussian noise
 JUMP_EV = 1.1  # relative to the neighbours; light and automatic exposure vary by 1.0 in good captures
 CLIPPED, CLIPPED_MORE = 0.5, 0.25  # share of clipped pixels, and its excess over most photos
 DARK_LEVEL, BRIGHT_LEVEL = 14.0, 244.0  # mean grey levels of a photo that shows nothing

@@ -14,6 +14,7 @@ from jaxtyping import Float64, Int64
 from scipy.sparse.linalg import LinearOperator, cg
 
 from splatpipe.pipeline.engine.parallel import ordered_map
+from splatpipe.pipeline.geometry.robust import huber_weights
 from splatpipe.pipeline.surface.depths.photo_gains import SHADING_TERMS, PhotoGains, shading_terms
 from splatpipe.pipeline.surface.depths.photo_samples import (
     PLAIN_TONE,
@@ -129,7 +130,7 @@ def _solve_levels(
         solution, _ = cg(operator, -sum_by_photo(deviations(light)).ravel(), x0=found.ravel(), rtol=TOLERANCE)
         found = solution.reshape(found.shape)
         off = np.abs(deviations(light + (terms * found[photo]).sum(axis=1)))
-        weight = np.minimum(1.0, HUBER / np.maximum(off, 1e-9))
+        weight = huber_weights(off, HUBER)
     observed = np.bincount(photo, minlength=photos) > 0
     if observed.any():
         found[:, 0] -= found[observed, 0].mean()

@@ -19,6 +19,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring
+from splatpipe.pipeline.geometry.robust import MAD_TO_SIGMA, huber_weights
 from splatpipe.pipeline.surface.heights.surface_file import SurfaceFile
 from splatpipe.pipeline.surface.measuring.ground_scale import ground_metres
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs
@@ -244,8 +245,8 @@ def _fit_rim(
             raise SplatpipeError("The polygon's outline encloses no area to fit a plane to.", "Draw another one.")
         terms = np.linalg.solve(normal, design.T @ (weight * up))
         off = up - design @ terms
-        spread = max(1.4826 * float(np.median(np.abs(off))), 1e-6)
-        weight = np.minimum(1.0, HUBER * spread / np.maximum(np.abs(off), 1e-9))
+        spread = max(MAD_TO_SIGMA * float(np.median(np.abs(off))), 1e-6)
+        weight = huber_weights(off, HUBER * spread)
     off = up - design @ terms
     variance = max(float(np.average(np.square(off), weights=weight)), float(np.mean(np.square(sigma))))
     covariance = np.linalg.inv(design.T @ (weight[:, None] * design)) * variance * SHARED_ALONG / RIM_CELLS

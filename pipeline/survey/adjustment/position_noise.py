@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float64, Int64
 
+from splatpipe.pipeline.geometry.robust import cauchy_weights
 from splatpipe.pipeline.survey.adjustment.block import Block, ReducedBlock
 from splatpipe.pipeline.survey.adjustment.block_adjustment import PositionObservations, factorised, solve
 
@@ -36,7 +37,6 @@ FACTOR_ROUNDS = 12
 MIN_RELATIVE_CHANGE = 0.01  # relative, of a factor
 MIN_FACTOR = 0.05
 ROBUST_ROUNDS = 30
-CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 MEDIAN_NORM = 1.538  # median norm of three standard normal coordinates
 BLUNDER_NOISES = 6.0  # times the noise of its class, as its root mean square along the axes
 BLUNDER_STATED = 3.0  # times the stated standard deviation: a smaller error is not a blunder
@@ -244,7 +244,7 @@ def find_blunders(
         typical = np.array(
             [max(float(np.median(normed[noise.of == c])) / MEDIAN_NORM, MIN_FACTOR) for c in range(len(typical))]
         )
-        after = 1.0 / (1.0 + (normed / (3.0**0.5 * CAUCHY * typical[noise.of])) ** 2)
+        after = cauchy_weights(normed, 3.0**0.5 * typical[noise.of])
         if np.abs(after - weights).max() < MIN_RELATIVE_CHANGE:
             break
         weights = after

@@ -21,6 +21,7 @@ from splatpipe.pipeline.geometry.correspondences import (
     Correspondences,
     DirectionPrior,
 )
+from splatpipe.pipeline.geometry.robust import cauchy_weights
 from splatpipe.pipeline.geometry.similarity import (
     SIMILARITY,
     Similarity,
@@ -39,7 +40,6 @@ STEP_TOLERANCE = 1e-9  # size of a step at which iterations end: radians, and re
 SEARCHED_ROUNDS = 3  # in which every correlation is tried; later ones try only the neighbours of the best
 FACTOR_ROUNDS = 2  # each; the rounds of the fit do the rest
 MIN_FACTOR = 1e-6  # least noise over the stated sigmas: exact positions have no noise to estimate
-CAUCHY = 2.385  # 95 % efficiency on Gaussian noise (Huber, Robust Statistics, 1981)
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def _cauchy(whitened: Float64[np.ndarray, "m p"]) -> Float64[np.ndarray, " m"]:
     """Cauchy weights by the joint residual of each point's three coordinates."""
     normed = np.sqrt((whitened[:, -1].reshape(-1, 3) ** 2).mean(axis=1))
     typical = max(float(np.median(normed)) / MEDIAN_OF_CHI3, 1e-12)
-    return np.repeat(1.0 / (1.0 + (normed / (CAUCHY * typical)) ** 2), 3)
+    return np.repeat(cauchy_weights(normed, typical), 3)
 
 
 def _held(points: Correspondences, similarity: Similarity, prior: DirectionPrior | None) -> Float64[np.ndarray, "p p"]:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.geometry.robust import MAD_TO_SIGMA
+
 MIN_GAP_S = 180.0  # a battery change takes at least this long
 GAP_INTERVALS = 20.0  # times the usual interval: manual capture at a photo a minute has longer pauses within a flight
 TAKEOFF_STEP_M = 1.0  # smaller steps are barometer drift
@@ -21,7 +23,6 @@ TAKEOFF_NOISES = 6.0  # times the spread within a flight: noisy altitudes must n
 MIN_PLATEAU = 3  # photos on each side needed to judge a step of the take-off altitude
 CANDIDATES = 20  # steps between neighbours that are examined, the largest first
 MAX_FLIGHTS = 1000  # flights of one device without a pause: more are implausible, and cost time
-MAD_TO_SIGMA = 1.4826  # standard deviation of Gaussian noise over its median absolute deviation
 
 
 @dataclass(frozen=True)
