@@ -25,7 +25,7 @@ from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.containers.ply import write_splat
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS, SplatFormat, format_named
 
 MAX_LOSS_DB = 0.1  # below the result of our own reader
 SURE_DB = 100.0  # above this, differences are rounding

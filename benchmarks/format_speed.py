@@ -22,7 +22,7 @@ from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.containers.ply import write_splat
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS, SplatFormat, format_named
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import Scene

@@ -27,7 +27,7 @@ import torch
 from mutations import mutated
 from tables import Row, print_table
 
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS, SplatFormat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts, SplatOrigin
 

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.model.scene import Scene
 

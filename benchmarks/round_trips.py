@@ -27,7 +27,7 @@ from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.containers.ply import write_splat
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS, SplatFormat
 from splatpipe.pipeline.splat.formats.files import write_scene
 from splatpipe.pipeline.splat.model.scene import Scene
 

@@ -16,7 +16,7 @@ from splatpipe.pipeline.photos.pixels.dataset import load_split, load_views
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels, reduced_camera, reduced_view
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
-from splatpipe.pipeline.render.floaters import measure_floaters
+from splatpipe.pipeline.render.floater_metric import measure_floaters
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS, EvaluateConfig
 from splatpipe.pipeline.render.rendering import as_trained, placed, render_depth, render_pixels
 from splatpipe.pipeline.render.splat_accuracy import measure_accuracy

@@ -13,7 +13,7 @@ from splatpipe.stages.line import GEOREF, LINE
 from splatpipe.stages.options import LineConfig
 
 if TYPE_CHECKING:
-    from splatpipe.pipeline.splat.formats import SplatFormat
+    from splatpipe.pipeline.splat.formats.catalogue import SplatFormat
 
 NEED_METRES, NEED_PLACE = {"laz"}, {"tiles"}
 
@@ -89,7 +89,7 @@ def convert_file(source: Path, target: Path, kind: SplatFormat) -> dict[str, Any
 
 def show_precision(facts: Mapping[str, Any]) -> None:
     """Print the origin taken off a splat's coordinates, the steps of its positions, and warnings, from a summary."""
-    from splatpipe.pipeline.app.commands.console import print_line
+    from splatpipe.pipeline.app.terminal.console import print_line
     from splatpipe.pipeline.splat.model.position_cost import two_digits
 
     unit = " m" if facts["metres"] else ""

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 
-from splatpipe.pipeline.app.commands.console import RunConsole
+from splatpipe.pipeline.app.terminal.console import RunConsole
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.files.output_file import own_folder, write_file

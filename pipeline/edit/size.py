@@ -13,7 +13,7 @@ import torch
 
 from splatpipe.pipeline.edit.workpiece import Workpiece
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.splat.formats import SplatFormat
+from splatpipe.pipeline.splat.formats.catalogue import SplatFormat
 from splatpipe.pipeline.splat.formats.files import write_scene
 from splatpipe.pipeline.splat.levels.reduction import Reduction, reduce_further, reduce_to
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

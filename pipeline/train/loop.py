@@ -32,9 +32,9 @@ from splatpipe.pipeline.train.plan.plan import TrainingPlan, load_or_write_plan,
 from splatpipe.pipeline.train.plan.start import read_start
 from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrder
 from splatpipe.pipeline.train.plan.windows import TrainingSize
-from splatpipe.pipeline.train.planning.measure import Step
-from splatpipe.pipeline.train.planning.planning import PlanningInput, plan_within_budgets
-from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
+from splatpipe.pipeline.train.sizing.measure import Step
+from splatpipe.pipeline.train.sizing.planning import PlanningInput, plan_within_budgets
+from splatpipe.pipeline.train.sizing.shortage import iterate_within_memory
 from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.state.history import History
 from splatpipe.pipeline.train.state.state import TrainState

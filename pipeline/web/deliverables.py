@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import Points
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import write_scene
 from splatpipe.pipeline.splat.levels.levels import LevelNode, build_levels
 from splatpipe.pipeline.splat.levels.streamed_sog import write_streamed_sog

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field
 
 from splatpipe.pipeline.engine.ranges import NonNegativeFloat
 from splatpipe.pipeline.engine.stage import StageConfig
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS
 
 EXPORT, WEB = "export", "web"
 """Folders under OUT that the formats are written to."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.jobs.plan import BATCH_FOLDER, BatchPlan, Call, PlannedCapture
-from splatpipe.pipeline.app.batch.jobs.slurm import ASK_INTERVAL_S, store_queue
+from splatpipe.pipeline.app.batch.jobs.slurm_queue import ASK_INTERVAL_S, store_queue
 from splatpipe.pipeline.app.batch.jobs.snakemake_process import (
     Profile,
     end_group,

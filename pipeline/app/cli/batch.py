@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from splatpipe.pipeline.app.commands.parameters import (
+from splatpipe.pipeline.app.terminal.parameters import (
     ConfigOption,
     DeviceOption,
     JsonOption,
@@ -19,8 +19,8 @@ from splatpipe.pipeline.app.commands.parameters import (
     ThreadsOption,
     UntilOption,
 )
-from splatpipe.pipeline.app.commands.runs import check_stage, overrides, request_of
-from splatpipe.pipeline.app.commands.summary import print_json
+from splatpipe.pipeline.app.terminal.runs import check_stage, overrides, request_of
+from splatpipe.pipeline.app.terminal.summary import print_json
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, exit_code
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def _run(captures: Path, out: Path, settings: Settings, profile: Profile, comman
     )
     from splatpipe.pipeline.app.batch.pages.publication import PAGE_FILE
     from splatpipe.pipeline.app.batch.planning import make_plan
-    from splatpipe.pipeline.app.commands.console import print_line
+    from splatpipe.pipeline.app.terminal.console import print_line
 
     listed = read_captures(captures, out)
     with lock_folder(out.resolve()) as lock:

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from splatpipe.pipeline.app.commands.parameters import (
+from splatpipe.pipeline.app.terminal.parameters import (
     ConfigOption,
     JsonOption,
     PhotosArgument,
     SetOption,
     ThreadsOption,
 )
-from splatpipe.pipeline.app.commands.runs import overrides
-from splatpipe.pipeline.app.commands.summary import CommandSummary
+from splatpipe.pipeline.app.terminal.runs import overrides
+from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, MachineError
 
 if TYPE_CHECKING:
@@ -42,10 +42,10 @@ def check(
     """Check a capture while still on site: its problems, and the time and memory of a run."""
     page = page.expanduser()
     with CommandSummary(page, as_json) as done, TemporaryDirectory(prefix="splatpipe-check-") as scratch:
-        from splatpipe.pipeline.app.commands.console import RunConsole, print_line
         from splatpipe.pipeline.app.preflight.examination import examine_capture
         from splatpipe.pipeline.app.preflight.findings import as_json as preflight_as_json
         from splatpipe.pipeline.app.preflight.page import write_page
+        from splatpipe.pipeline.app.terminal.console import RunConsole, print_line
         from splatpipe.pipeline.engine.config import load_preset
         from splatpipe.pipeline.engine.events import EventReporter
         from splatpipe.pipeline.engine.machine import available_cores
@@ -74,7 +74,7 @@ def check(
 
 
 def _show(preflight: Preflight) -> None:
-    from splatpipe.pipeline.app.commands.console import print_line
+    from splatpipe.pipeline.app.terminal.console import print_line
 
     for finding in preflight.findings:
         print_line(f"{SIGNS[finding.severity]} {finding.message} {finding.hint}".rstrip())

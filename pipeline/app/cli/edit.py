@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from splatpipe.pipeline.app.commands.parameters import JsonOption, ThreadsOption, expand_user
-from splatpipe.pipeline.app.commands.summary import CommandSummary
+from splatpipe.pipeline.app.terminal.parameters import JsonOption, ThreadsOption, expand_user
+from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
 ORDER = "splatpipe.order"
@@ -167,7 +167,7 @@ def steps_in_order(order: Sequence[str], options: Mapping[str, Any]) -> list[tup
 def _edit(
     source: Path, target: tuple[Path, str | None], given: Sequence[tuple[str, Any]], how: tuple[bool, bool, int]
 ) -> dict[str, Any]:
-    from splatpipe.pipeline.app.commands.console import RunConsole
+    from splatpipe.pipeline.app.terminal.console import RunConsole
     from splatpipe.pipeline.edit.editing import EditTask, edit_splat
     from splatpipe.pipeline.edit.size import OutputFile
     from splatpipe.pipeline.edit.sources import open_source
@@ -192,9 +192,9 @@ def _edit(
 
 
 def _show(facts: Mapping[str, Any]) -> None:
-    from splatpipe.pipeline.app.commands.console import print_line
     from splatpipe.pipeline.app.formats import show_precision
     from splatpipe.pipeline.app.report.facts.wording import plural
+    from splatpipe.pipeline.app.terminal.console import print_line
 
     for step in facts["steps"]:
         before, after = step["gaussians"]

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from splatpipe.pipeline.app.commands.parameters import (
+from splatpipe.pipeline.app.terminal.parameters import (
     DeviceOption,
     JsonOption,
     NotifyOption,
@@ -17,8 +17,8 @@ from splatpipe.pipeline.app.commands.parameters import (
     WaitOption,
     expand_user,
 )
-from splatpipe.pipeline.app.commands.runs import RunSession, existing_request, overrides
-from splatpipe.pipeline.app.commands.summary import CommandSummary
+from splatpipe.pipeline.app.terminal.runs import RunSession, existing_request, overrides
+from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
 FormatsOption = Annotated[
@@ -70,9 +70,9 @@ def convert(
 ) -> None:
     """Convert a splat file to another format; its georeference is kept."""
     with CommandSummary(target, as_json) as done:
-        from splatpipe.pipeline.app.commands.console import print_line
         from splatpipe.pipeline.app.formats import convert_file, show_precision
         from splatpipe.pipeline.app.report.facts.wording import plural, size
+        from splatpipe.pipeline.app.terminal.console import print_line
         from splatpipe.pipeline.splat.formats.files import format_of_name
 
         kind = format_of_name(target, format_name)

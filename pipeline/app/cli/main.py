@@ -15,7 +15,7 @@ from splatpipe.pipeline.app.cli.check import check
 from splatpipe.pipeline.app.cli.edit import OrderedCommand, edit
 from splatpipe.pipeline.app.cli.formats import convert, export
 from splatpipe.pipeline.app.cli.help import with_help
-from splatpipe.pipeline.app.commands.parameters import (
+from splatpipe.pipeline.app.terminal.parameters import (
     BoundaryOption,
     ConfigOption,
     DeviceOption,
@@ -44,7 +44,7 @@ from splatpipe.pipeline.app.commands.parameters import (
     expand_user,
     stages,
 )
-from splatpipe.pipeline.app.commands.runs import (
+from splatpipe.pipeline.app.terminal.runs import (
     Overrides,
     RunSession,
     check_stage,
@@ -57,7 +57,7 @@ from splatpipe.pipeline.app.commands.runs import (
     with_boundary,
     with_budgets,
 )
-from splatpipe.pipeline.app.commands.summary import CommandSummary, for_the_user, print_json
+from splatpipe.pipeline.app.terminal.summary import CommandSummary, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
@@ -316,7 +316,7 @@ def view(
     ] = None,
 ) -> None:
     """Show a run in the browser: training progress and results; with --mark, mark control points."""
-    from splatpipe.pipeline.app.commands.console import print_line
+    from splatpipe.pipeline.app.terminal.console import print_line
     from splatpipe.pipeline.app.view.server import ViewOptions, serve
 
     if points is not None and not mark:
@@ -327,7 +327,7 @@ def view(
 @with_help(app)
 def status(out: OutArgument, as_json: JsonOption = False) -> None:
     """Show the status of each stage: what is valid, what is out of date, and why."""
-    from splatpipe.pipeline.app.commands.console import show_status
+    from splatpipe.pipeline.app.terminal.console import show_status
     from splatpipe.pipeline.engine.runs.line import line_status
     from splatpipe.pipeline.engine.runs.session import status_of
 
@@ -341,8 +341,8 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
 @with_help(app)
 def report(out: OutArgument, as_json: JsonOption = False) -> None:
     """Write OUT/report.html again from the existing results."""
-    from splatpipe.pipeline.app.commands.console import print_line
     from splatpipe.pipeline.app.report import make_report
+    from splatpipe.pipeline.app.terminal.console import print_line
     from splatpipe.pipeline.engine.runs.run_folder import LOG_FILE, open_run_folder
     from splatpipe.stages.line import LINE
 
@@ -356,8 +356,8 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 @with_help(app)
 def tidy(out: OutArgument, as_json: JsonOption = False) -> None:
     """Remove artifacts that the current configuration no longer uses."""
-    from splatpipe.pipeline.app.commands.console import print_line
     from splatpipe.pipeline.app.report.facts.wording import plural, size
+    from splatpipe.pipeline.app.terminal.console import print_line
     from splatpipe.pipeline.engine.runs.line import line_status
     from splatpipe.pipeline.engine.runs.lock import locked
     from splatpipe.pipeline.engine.runs.session import status_of
@@ -374,7 +374,7 @@ def tidy(out: OutArgument, as_json: JsonOption = False) -> None:
 @app.command(hidden=True)
 def clean(out: OutArgument, as_json: JsonOption = False) -> None:
     """The former name of ``tidy``."""
-    from splatpipe.pipeline.app.commands.console import print_line
+    from splatpipe.pipeline.app.terminal.console import print_line
 
     print_line("splatpipe clean is now called splatpipe tidy; the stage clean removes floaters.")
     tidy(out, as_json)
@@ -383,7 +383,7 @@ def clean(out: OutArgument, as_json: JsonOption = False) -> None:
 @with_help(app)
 def options(preset: PresetOption = "standard") -> None:
     """List every option with its value in a preset and its description."""
-    from splatpipe.pipeline.app.commands.console import show_table
+    from splatpipe.pipeline.app.terminal.console import show_table
     from splatpipe.pipeline.engine.config import load_preset, lookup, option_help
 
     resolved = Overrides([]).resolve(load_preset(preset))
@@ -400,9 +400,9 @@ def doctor(
     as_json: JsonOption = False,
 ) -> None:
     """Check this machine: its capabilities, and problems to resolve before a run."""
-    from splatpipe.pipeline.app.commands.console import print_line, show_table
     from splatpipe.pipeline.app.doctor import examine
     from splatpipe.pipeline.app.machine_warnings import machine_warnings
+    from splatpipe.pipeline.app.terminal.console import print_line, show_table
 
     place = out or Path.cwd()
     findings, warnings = examine(place), machine_warnings(place)
@@ -436,12 +436,12 @@ def main() -> NoReturn:
             )
         raise
     except StopSignal as error:
-        from splatpipe.pipeline.app.commands.console import print_line
+        from splatpipe.pipeline.app.terminal.console import print_line
 
         print_line(f"{error} {error.hint}")
         sys.exit(error.exit_code)
     except Exception as error:
-        from splatpipe.pipeline.app.commands.console import show_error
+        from splatpipe.pipeline.app.terminal.console import show_error
 
         user_error = for_the_user(error)
         show_error(user_error)

@@ -1,4 +1,5 @@
-// A pass of a stable radix sort, in three phases: count each block's digits, prefix-sum them over the blocks, scatter.
+// Sorts the pairs of splats and tiles: a pass of a stable radix sort, in three phases (count each block's digits,
+// prefix-sum them over the blocks, scatter).
 //
 // Equal digits keep the order of the keys: a virtual block has kSortBlock consecutive keys, each of its warps a
 // consecutive part of these, and a warp takes kWarp at a time.

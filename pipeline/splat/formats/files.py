@@ -9,7 +9,7 @@ from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, Usage
 from splatpipe.pipeline.engine.files.durable import beside
 from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, SplatFormat, format_named
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS, SplatFormat, format_named
 from splatpipe.pipeline.splat.model.position_cost import PositionCost, two_digits
 from splatpipe.pipeline.splat.model.scene import Scene
 

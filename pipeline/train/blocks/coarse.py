@@ -22,8 +22,8 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.start import started
 from splatpipe.pipeline.train.plan.windows import TrainingSize
-from splatpipe.pipeline.train.planning.measure import Step
-from splatpipe.pipeline.train.planning.planning import PlanningInput
+from splatpipe.pipeline.train.sizing.measure import Step
+from splatpipe.pipeline.train.sizing.planning import PlanningInput
 
 SKIES = "skies.npz"
 

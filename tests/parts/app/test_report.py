@@ -20,7 +20,6 @@ from finished_run import linked_copy, write_apart
 from PIL import Image
 
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.commands.console import show_bad_cameras
 from splatpipe.pipeline.app.report import is_current, make_report, write_report
 from splatpipe.pipeline.app.report.capture import unit_of
 from splatpipe.pipeline.app.report.charts.pictures import CROP_SIDE_PX, MAX_CROPS, chosen_views, cut_crops
@@ -28,6 +27,7 @@ from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
 from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
 from splatpipe.pipeline.app.report.verdict import judge
+from splatpipe.pipeline.app.terminal.console import show_bad_cameras
 
 
 @pytest.fixture(scope="module")

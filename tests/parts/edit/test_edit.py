@@ -31,7 +31,8 @@ from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vec
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.containers.ply import property_names
-from splatpipe.pipeline.splat.formats import format_named, plain_ply
+from splatpipe.pipeline.splat.formats import plain_ply
+from splatpipe.pipeline.splat.formats.catalogue import format_named
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import MAX_EDITS, Scene, SceneFacts, SplatOrigin, turn_of
 from splatpipe.pipeline.survey.crs.frames import Origin

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from unattended_runs import LINE, events, goes_on, largest_file, request_of, walk
 
-from splatpipe.pipeline.app.commands.console import RunConsole, print_line, show_error
-from splatpipe.pipeline.app.commands.summary import for_the_user
+from splatpipe.pipeline.app.terminal.console import RunConsole, print_line, show_error
+from splatpipe.pipeline.app.terminal.summary import for_the_user
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, MachineError, SplatpipeError
 from splatpipe.pipeline.engine.events import Event, EventLog, parse_event
 
@@ -135,7 +135,7 @@ def test_time_left_is_that_of_the_step_and_unknown_until_it_advances(
 ) -> None:
     """A resumed training begins in the middle; counts start again in each step, and in a step that is repeated."""
     console, clock_s = RunConsole(), iter(range(1000, 2000, 20))
-    monkeypatch.setattr("splatpipe.pipeline.app.commands.console.time.monotonic", lambda: float(next(clock_s)))
+    monkeypatch.setattr("splatpipe.pipeline.app.terminal.console.time.monotonic", lambda: float(next(clock_s)))
     for what, done in (("a", 80), ("a", 90), ("b", 0), ("b", 50), ("b", 0), ("b", 20), ("b", 100)):
         console(Event("progress", "sparse", {"done": done, "total": 100, "what": what, "unit": "photos"}))
     lines = [line.partition("photos")[2] for line in capfd.readouterr().err.splitlines()]
@@ -146,7 +146,7 @@ def test_time_left_is_that_of_the_step_and_unknown_until_it_advances(
 def test_time_left_is_that_of_all_shards_unless_one_is_made_alone(
     stages: list[str], mentions_rest: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatpipe.pipeline.app.commands.console.PLAIN_INTERVAL_S", -1.0)
+    monkeypatch.setattr("splatpipe.pipeline.app.terminal.console.PLAIN_INTERVAL_S", -1.0)
     console = RunConsole()
     console(Event("run_started", data={"stages": stages}))
     console(Event("stage_started", "train.2", {"reason": "", "shard": {"number": 2, "count": 4}}))

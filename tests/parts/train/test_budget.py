@@ -51,8 +51,8 @@ from splatpipe.pipeline.train.plan.limits import (
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, duration, make_plan
 from splatpipe.pipeline.train.plan.schedule import resolve_schedule
 from splatpipe.pipeline.train.plan.start import InitialGaussians
-from splatpipe.pipeline.train.planning import planning
-from splatpipe.pipeline.train.planning.measure import MachineSpeed, middle_of
+from splatpipe.pipeline.train.sizing import planning
+from splatpipe.pipeline.train.sizing.measure import MachineSpeed, middle_of
 from splatpipe.pipeline.train.state import memory
 from splatpipe.pipeline.train.state.memory import resident_bytes
 from splatpipe.pipeline.train.state.state import TrainState
@@ -434,7 +434,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.stages import train
 from splatpipe.pipeline.train.plan import plan
-from splatpipe.pipeline.train.planning.measure import middle_of
+from splatpipe.pipeline.train.sizing.measure import middle_of
 from splatpipe.pipeline.train.plan.lengths import PART_VISITS, WHOLE_VISITS, lengths_of
 from splatpipe.pipeline.train.plan.limits import FIXED_BYTES
 from splatpipe.pipeline.train.state.memory import resident_bytes

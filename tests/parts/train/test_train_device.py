@@ -12,7 +12,7 @@ import torch
 from on_cpu import kernels_on_cpu
 from torch import Tensor
 
-from splatpipe.pipeline.app.commands.summary import for_the_user
+from splatpipe.pipeline.app.terminal.summary import for_the_user
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, MachineError, UsageError, card_fault, exit_code
 from splatpipe.pipeline.engine.runs.worker import as_splatpipe_error
 from splatpipe.pipeline.engine.stage import Inputs, Machine
@@ -29,8 +29,8 @@ from splatpipe.pipeline.train.photos.upload import QUEUED, Upload, Uploader, col
 from splatpipe.pipeline.train.plan import limits
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.plan.start import InitialGaussians
-from splatpipe.pipeline.train.planning import planning
-from splatpipe.pipeline.train.planning.planning import PlanningInput, pilot
+from splatpipe.pipeline.train.sizing import planning
+from splatpipe.pipeline.train.sizing.planning import PlanningInput, pilot
 from splatpipe.pipeline.train.state import memory, state
 from splatpipe.pipeline.train.state.checkpoint import (
     BrokenCheckpointError,

@@ -32,7 +32,7 @@ from splatpipe.pipeline.train.appearance.sky_file import read_skies, write_skies
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.planning.measure import MeasuringBudget, TimedScene, measure
+from splatpipe.pipeline.train.sizing.measure import MeasuringBudget, TimedScene, measure
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import evaluate, initialize, train
 

@@ -18,7 +18,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.photos.upload import Uploader
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.planning.shortage import iterate_within_memory
+from splatpipe.pipeline.train.sizing.shortage import iterate_within_memory
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.pipeline.train.techniques.techniques import make_techniques
 

@@ -32,9 +32,9 @@ from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
-from splatpipe.pipeline.train.planning import shortage
-from splatpipe.pipeline.train.planning.measure import Step
-from splatpipe.pipeline.train.planning.planning import PlanningInput
+from splatpipe.pipeline.train.sizing import shortage
+from splatpipe.pipeline.train.sizing.measure import Step
+from splatpipe.pipeline.train.sizing.planning import PlanningInput
 from splatpipe.pipeline.train.state import state
 from splatpipe.pipeline.train.state.checkpoint import load_checkpoint, save_checkpoint
 from splatpipe.pipeline.train.state.state import TrainState

@@ -17,7 +17,8 @@ from repository import ROOT
 from splatpipe.pipeline.app.batch.capture_list import read_captures
 from splatpipe.pipeline.app.batch.driver import fresh_call
 from splatpipe.pipeline.app.batch.jobs import job as job_module
-from splatpipe.pipeline.app.batch.jobs import slurm, snakemake_process
+from splatpipe.pipeline.app.batch.jobs import slurm_queue as slurm
+from splatpipe.pipeline.app.batch.jobs import snakemake_process
 from splatpipe.pipeline.app.batch.jobs.attempts import AttemptLog, AttemptResult
 from splatpipe.pipeline.app.batch.jobs.engine_errors import ERRORS_FILE, ErrorRecorder, read_errors
 from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, StageJob, workflow_jobs

@@ -1,6 +1,6 @@
 """Errors of other libraries become messages for the user."""
 
-from splatpipe.pipeline.app.commands.summary import for_the_user
+from splatpipe.pipeline.app.terminal.summary import for_the_user
 from splatpipe.pipeline.engine.errors import MachineError
 
 

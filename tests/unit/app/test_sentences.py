@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from splatpipe.pipeline.app.commands.console import show_verdict
-from splatpipe.pipeline.app.commands.sentences import SENTENCES, sentence
 from splatpipe.pipeline.app.report.facts.run_history import RunHistory, StageHistory, StageMessages
 from splatpipe.pipeline.app.report.verdict import Verdict, VerdictLine, judge
+from splatpipe.pipeline.app.terminal.console import show_verdict
+from splatpipe.pipeline.app.terminal.sentences import SENTENCES, sentence
 from splatpipe.stages.line import LINE
 
 PLACED = {"photos": 40, "registered": 40, "mean_reprojection_error_px": 0.3225, "points3d": 23143}

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatpipe.pipeline.app.commands.runs import overrides, with_budgets
+from splatpipe.pipeline.app.terminal.runs import overrides, with_budgets
 from splatpipe.pipeline.engine.config import (
     current_options,
     dump,

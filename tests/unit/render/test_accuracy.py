@@ -260,7 +260,7 @@ def test_the_tables_figures_match_their_definitions() -> None:
 
 
 def test_the_terminal_shows_the_tables_and_each_point(capsys: pytest.CaptureFixture[str]) -> None:
-    from splatpipe.pipeline.app.commands.console import show_accuracy
+    from splatpipe.pipeline.app.terminal.console import show_accuracy
 
     check = accuracy_table(np.array([[0.012, -0.034, 0.056], [0.01, 0.02, np.nan]]))
     report = {"gsd_m": 0.0312, "tables": {"gps": None, "control": None, "check": check}, "splat": None}

@@ -14,7 +14,7 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.blocked_light import blocked_shares
-from splatpipe.pipeline.render.floaters import measure_floaters
+from splatpipe.pipeline.render.floater_metric import measure_floaters
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.quality.free_space import free_space, near_or_free
 

@@ -10,7 +10,8 @@ from some_splats import some_gaussians
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.splat.containers.ply import property_names
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, plain_ply
+from splatpipe.pipeline.splat.formats import plain_ply
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import read_scene, write_scene
 from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

@@ -8,7 +8,7 @@ import torch
 from some_splats import some_gaussians
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS
 from splatpipe.pipeline.splat.formats.files import read_scene, write_scene
 from splatpipe.pipeline.splat.model.position_cost import PositionCost
 from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts

@@ -9,7 +9,8 @@ from some_splats import some_gaussians
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.splat.containers.ply import write_splat
-from splatpipe.pipeline.splat.formats import SPLAT_FORMATS, format_named, model_folder, plain_ply
+from splatpipe.pipeline.splat.formats import model_folder, plain_ply
+from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS, format_named
 from splatpipe.pipeline.splat.formats.files import (
     format_of_content,
     format_of_name,

@@ -1,4 +1,4 @@
-"""The log of a capture's jobs: one line when an attempt starts and one when it ends."""
+"""What became of each attempt of a job (finished, failed, cancelled, killed): their log and the engine's word."""
 
 from __future__ import annotations
 

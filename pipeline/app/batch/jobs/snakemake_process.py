@@ -26,7 +26,7 @@ from pathlib import Path
 from splatpipe.pipeline.app.batch.jobs.engine_errors import record_errors
 from splatpipe.pipeline.app.batch.jobs.job import end_with_parent
 from splatpipe.pipeline.app.batch.jobs.plan import MEGABYTE, BatchPlan, Call
-from splatpipe.pipeline.app.batch.jobs.slurm import largest_node
+from splatpipe.pipeline.app.batch.jobs.slurm_queue import largest_node
 from splatpipe.pipeline.app.batch.jobs.workflow import SNAKEFILE
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.files.output_file import appended_file, write_file

@@ -25,8 +25,8 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from splatpipe.pipeline.app.commands.sentences import sentence
 from splatpipe.pipeline.app.report.verdict import CAMERAS, Verdict
+from splatpipe.pipeline.app.terminal.sentences import sentence
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.runs.line import StageStatus

@@ -77,7 +77,7 @@ class CommandSummary:
 
     def _notify(self, command: str, error: BaseException | None) -> None:
         """Call the user's command; its problems are reported and do not affect the run."""
-        from splatpipe.pipeline.app.commands.console import print_line
+        from splatpipe.pipeline.app.terminal.console import print_line
 
         state: State = "done" if error is None else "failed"
         limit_s = TIME_LIMIT_S
@@ -91,8 +91,8 @@ class CommandSummary:
 
     def _report(self, error: BaseException | None) -> None:
         """Write the report, unless it is there and no stage ran; its problems do not affect the run."""
-        from splatpipe.pipeline.app.commands.console import print_line
         from splatpipe.pipeline.app.report import REPORT_FILE, is_current, make_report
+        from splatpipe.pipeline.app.terminal.console import print_line
         from splatpipe.pipeline.engine.runs.run_folder import LOG_FILE
 
         if error is None and self.outcome is not None and not self.outcome.ran and is_current(self._out):
@@ -105,7 +105,7 @@ class CommandSummary:
             print_line(f"{trouble.message} {trouble.hint}".strip())
 
     def _show(self, outcome: Outcome, seconds: float) -> None:
-        from splatpipe.pipeline.app.commands.console import show_accuracy, show_bad_cameras, show_outputs, show_verdict
+        from splatpipe.pipeline.app.terminal.console import show_accuracy, show_bad_cameras, show_outputs, show_verdict
 
         if (verdict := _verdict(self._out)) is not None:
             show_verdict(verdict)

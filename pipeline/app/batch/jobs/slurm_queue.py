@@ -1,4 +1,4 @@
-"""What the batch asks Slurm: the size of the largest node, and why jobs are waiting in the queue."""
+"""Slurm's nodes and queue: the size of the largest node, and why jobs are waiting in the queue."""
 
 from __future__ import annotations
 

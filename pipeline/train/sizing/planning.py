@@ -20,8 +20,8 @@ from splatpipe.pipeline.train.plan.limits import FIRST_ITERATIONS, device_bytes_
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of
 from splatpipe.pipeline.train.plan.start import InitialGaussians, started
 from splatpipe.pipeline.train.plan.windows import TrainingSize
-from splatpipe.pipeline.train.planning.measure import MachineSpeed, MeasuringBudget, Step, TimedScene, measure
-from splatpipe.pipeline.train.planning.shortage import HINT
+from splatpipe.pipeline.train.sizing.measure import MachineSpeed, MeasuringBudget, Step, TimedScene, measure
+from splatpipe.pipeline.train.sizing.shortage import HINT
 from splatpipe.pipeline.train.state.memory import within_memory
 
 MEASURE_SHARE = 0.05  # share of the budget spent on measuring at most

@@ -105,9 +105,9 @@ def spent_s() -> float:
 
 def print_forecast(request: Request, until: str | None) -> None:
     """Print the forecast for the whole pipeline, before its first training, and whether memory may not suffice."""
-    from splatpipe.pipeline.app.commands.console import print_line
-    from splatpipe.pipeline.app.commands.summary import PART_VARIABLE
     from splatpipe.pipeline.app.preflight.start import forecast_text, shortage_text
+    from splatpipe.pipeline.app.terminal.console import print_line
+    from splatpipe.pipeline.app.terminal.summary import PART_VARIABLE
 
     trained = any((request.out / "stages").glob("train-*"))
     if trained or PART_VARIABLE in os.environ:
@@ -169,7 +169,7 @@ class RunSession:
         self._request, self._wait, self._shard = request, wait, shard
 
     def __enter__(self) -> Runner:
-        from splatpipe.pipeline.app.commands.console import RunConsole
+        from splatpipe.pipeline.app.terminal.console import RunConsole
         from splatpipe.pipeline.engine.runs.session import open_session
 
         self._console = RunConsole()
@@ -187,8 +187,8 @@ class RunSession:
 
     def _update_viewer(self) -> None:
         """Update the measurements in the viewer while OUT is locked; problems are only reported."""
-        from splatpipe.pipeline.app.commands.console import print_line
         from splatpipe.pipeline.app.measured_viewer import update_viewer
+        from splatpipe.pipeline.app.terminal.console import print_line
 
         try:
             trouble = update_viewer(self._request.out)

@@ -1,1 +1,0 @@
-"""What every command shares: its parameters, preparation, console and summary."""
