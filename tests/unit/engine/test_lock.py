@@ -74,8 +74,8 @@ def test_of_two_overlapping_signatures_the_last_one_is_read(out: Path) -> None:
     path = out / "stages" / LOCK_FILE
     with locked(out):
         own = path.read_bytes()
-    assert len(own) == engine_lock.WIDTH
-    longer = json.dumps({**ELSEWHERE, "host": "node7" * 20}).encode().ljust(engine_lock.WIDTH)
+    assert len(own) == engine_lock.SIGNATURE_BYTES
+    longer = json.dumps({**ELSEWHERE, "host": "node7" * 20}).encode().ljust(engine_lock.SIGNATURE_BYTES)
     path.write_bytes(longer)
     with path.open("r+b") as file:
         file.write(own)
