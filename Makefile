@@ -129,7 +129,7 @@ aarch64: .venv/.dependencies
 
 # Libraries, captures, wheels and peers for a visit to a GPU on a bare machine, and the commands to run there.
 gpu-visit: $(EITHER)
-	@$(BIN)/python benchmarks/gpu_visit.py prepare $(PEERS:%=--peers %) $(FIRST:%=--first %)
+	@$(BIN)/python benchmarks gpu_visit prepare $(PEERS:%=--peers %) $(FIRST:%=--first %)
 
 # No weak symbols in code compiled per instruction set; only the C interface of CUDA, for every requested device.
 symbols: .venv/.tested

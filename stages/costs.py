@@ -1,6 +1,6 @@
 """Cost per unit of work of each stage: constants for forecasts, fitted to finished runs. Light to import.
 
-`benchmarks/forecast.py --costs` fits and prints them; `benchmarks/forecast.json` has the runs, at `preview` with two
+`python benchmarks forecast --costs` fits and prints them; `benchmarks/line/forecast.json` has the runs, at `preview` with two
 threads on a shared 2-core x86-64 machine with AVX-512. CPU seconds are those of that machine.
 """
 

@@ -3,7 +3,7 @@
 Evidence is combined by logistic regression (D. R. Cox, "The regression analysis of binary sequences", 1958): how much
 a Gaussian increases the photos' error, how far in front of everything else it is, how opaque it is, and whether it
 is connected to undoubted parts of the scene. The weights were fitted to floaters planted into two captures, and tested
-on other planted floaters and on a third capture (`benchmarks/planted_floaters.py`, trials.md).
+on other planted floaters and on a third capture (`benchmarks/splats/planted_floaters.py`, trials.md).
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from mutations import mutated
 from PIL import Image
 
 READABLE = list(mutated_files.readable())
-FILES = 60  # damaged files per format; benchmarks/mutated_files.py reads 5,000
+FILES = 60  # damaged files per format; benchmarks/formats/mutated_files.py reads 5,000
 FIRST = 19_000  # other seeds than the benchmark's
 
 

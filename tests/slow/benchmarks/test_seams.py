@@ -1,17 +1,15 @@
 """benchmarks/seams finds planted seams in a finished run."""
 
 import subprocess
-import sys
 from pathlib import Path
 
-from repository import BENCHMARKS
+from repository import benchmark
 
 
 def test_benchmark_finds_planted_seams(demo_run: Path) -> None:
     """On the demo, whose splat also serves as the model without blocks: no alarm, and some of each kind found."""
     coarse = next((demo_run / "stages").glob("train-*/model.ply"))
-    script = BENCHMARKS / "seams.py"
-    command = [sys.executable, str(script), str(demo_run), str(coarse), "--blocks", "2", "--plant"]
+    command = benchmark("seams", demo_run, coarse, "--blocks", 2, "--plant")
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "0 seams on 1 borders" in done.stdout

@@ -2,11 +2,10 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import flight_scene as scene
-from repository import BENCHMARKS
+from repository import benchmark
 
 
 def test_mappings_are_measured_on_the_same_matches(tmp_path: Path) -> None:
@@ -16,7 +15,7 @@ def test_mappings_are_measured_on_the_same_matches(tmp_path: Path) -> None:
     scene.write_database(small, database, 2)
     truth = {"photos": [{"name": f"{i:05d}.jpg", "centre_m": small.centres_m[i].tolist()} for i in range(6)]}
     (tmp_path / "truth.json").write_text(json.dumps(truth))
-    words = [sys.executable, str(BENCHMARKS / "sfm_speed.py"), str(tmp_path), "--truth", str(tmp_path / "truth.json")]
+    words = benchmark("sfm_speed", tmp_path, "--truth", tmp_path / "truth.json")
     subprocess.run([*words, "--mappers", "before", "ours", "--json", str(tmp_path / "rows.json")], check=True)
     rows = json.loads((tmp_path / "rows.json").read_text())
     assert [row["how"] for row in rows] == ["before", "ours", "before", "ours"]

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import trimesh
 from PIL import Image
 from rasterio.transform import Affine
 from rays import first_hits
-from repository import BENCHMARKS
+from repository import benchmark
 from surface_checks import matching, measure_dsm, measure_facades, measure_points, target_difference
 from surface_products import Facade, Raster, plan_crs, read_cloud, read_facades, read_mesh, read_raster, true_frame
 from surface_scene import GSD_M, SceneTruth, TruthGrid, site_of, straight, true_picture
@@ -389,6 +388,5 @@ def test_depth_maps_read_back_from_their_files(tmp_path: Path) -> None:
 
 
 def test_nothing_to_measure_is_reported(tmp_path: Path) -> None:
-    command = [sys.executable, BENCHMARKS / "surface_truth.py", tmp_path]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(benchmark("surface_truth", tmp_path), capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "has none of" in done.stderr

@@ -3,14 +3,13 @@
 import json
 import math
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import measure
 import pytest
 import tiny_scene
-from repository import BENCHMARKS
+from repository import benchmark
 
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
@@ -30,7 +29,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(name: str, dataset: Path, out: Path, *options: str) -> dict[str, Any]:
-    command = [sys.executable, str(BENCHMARKS / f"{name}.py"), "--data", str(dataset), "--json", str(out), *options]
+    command = benchmark(name, "--data", dataset, "--json", out, *options)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert name in done.stdout

@@ -1,4 +1,4 @@
-"""On a real device: what the harness cannot show. Run by ``benchmarks/gpu_visit.py``, without tests/conftest.py.
+"""On a real device: what the harness cannot show. Run by ``benchmarks/gpu/gpu_visit.py``, without tests/conftest.py.
 
 The kernels' numbers are proven without a device, by the harness; here, that the compiled ones give the same.
 """

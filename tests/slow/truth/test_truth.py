@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from opened_run import OpenedRun, open_run
 from path_frames import measure_path, summary
 from rays import first_hits
-from repository import BENCHMARKS
+from repository import benchmark
 
 from splatpipe.demo import CAPTURE, capture_path
 from splatpipe.demo.scene import building_corners
@@ -212,7 +212,7 @@ def test_depth_errors_are_those_of_rays_that_hit_the_house(
 
 def test_demo_truth_measures_a_model_beside_the_one_trained_for_the_size(out: Path, tmp_path: Path) -> None:
     """The same model is as good as itself; the capture's photos are large enough for double the size of this run."""
-    command = [sys.executable, BENCHMARKS / "demo_truth.py", out, "--half", out, "--double", out, "--save", tmp_path]
+    command = benchmark("demo_truth", out, "--half", out, "--double", out, "--save", tmp_path)
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     assert "median depth on the house" in done.stdout and "scales" in done.stdout
     found = json.loads((tmp_path / "demo_truth.json").read_text())

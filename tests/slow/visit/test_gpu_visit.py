@@ -386,7 +386,7 @@ def test_what_is_carried_is_weighed_and_the_command_printed(
 
     gpu_prepare.print_commands(place.pack, again=False)
     said = capsys.readouterr().out
-    assert "python3 benchmarks/gpu_visit.py first --pack " in said and "timeout_s 420" in said
+    assert "python3 benchmarks gpu_visit first --pack " in said and "timeout_s 420" in said
     print(next(line for line in said.splitlines() if "MiB, the tree's" in line))
     monkeypatch.setattr(gpu_prepare, "MAX_MEBIBYTES", 1)
     with pytest.raises(SystemExit, match="too much"):

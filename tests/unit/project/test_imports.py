@@ -14,7 +14,7 @@ PATHS = (
     "tests/harness",
     "tests/lines",
     "tests/records",
-    "benchmarks",
+    *(str(path.relative_to(ROOT)) for path in ROOT.glob("benchmarks/*/")),
 )  # where plain names are found
 
 

@@ -1,0 +1,130 @@
+"""Fit the forecasts' costs to finished runs, and show the errors on runs that were left out of the fit.
+
+python benchmarks forecast                       # the table of figures that is kept: fits, leaves one capture out
+python benchmarks forecast --add OUT NAME PRESET # reads a run's manifests (at least to `sparse`) into that table
+    --stage sparse --speed 0.5                      # … of one stage only; its machine was half as fast as the reference
+python benchmarks forecast --costs               # prints the fitted costs, for stages/costs.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from forecast_fit import FinishedRun, ForecastRatio, compared, fit, left_out, read_run
+from tables import print_table
+
+from splatpipe.pipeline.engine.config import load_preset, resolve
+from splatpipe.stages.costs import REFERENCE, Costs
+from splatpipe.stages.options import LineConfig
+
+TABLE = Path(__file__).with_name("forecast.json")
+FITTED_TO = "preview"  # runs of other presets are reported, not fitted
+MEMORY_WITHIN = 0.3
+CPU_WITHIN = 1.5
+ROUNDING = 0.01  # relative rounding error of the costs in `stages/costs.py`, which have three digits
+DISPLAYED_STAGES = ("features", "matches", "sparse", "initialize", "train")
+
+
+def main() -> int:
+    """Run the command; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--add", nargs=3, metavar=("OUT", "NAME", "PRESET"))
+    parser.add_argument("--stage", help="add this stage's figures only, and keep the others of the row")
+    parser.add_argument(
+        "--speed", type=float, default=1.0, help="of the run's machine: CPU seconds are multiplied by it"
+    )
+    parser.add_argument("--costs", action="store_true")
+    options = parser.parse_args()
+    rows = json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.is_file() else []
+    if options.add:
+        out, name, preset = options.add
+        row = read_run(Path(out), configured(preset), name).as_row(preset)
+        for figures in row["used"].values():
+            figures[0] = round(options.speed * figures[0], 2)
+        kept = [old for old in rows if (old["name"], old["preset"]) != (name, preset)]
+        if options.stage:
+            row["used"] = {options.stage: row["used"][options.stage]}
+            for old in rows:
+                if (old["name"], old["preset"]) == (name, preset):
+                    row = {**old, "used": {**old["used"], **row["used"]}}
+        lines = (
+            json.dumps(entry) for entry in sorted([*kept, row], key=lambda entry: (entry["preset"], entry["name"]))
+        )
+        TABLE.write_text("[\n" + ",\n".join(lines) + "\n]\n", encoding="utf-8")
+        return 0
+    fitted_to, others = runs_of(rows)
+    if options.costs:
+        sys.stdout.write(costs_text(fit(fitted_to)) + "\n")
+        return 0
+    show(f"{FITTED_TO}, each against the costs of the others: forecast over used", left_out(fitted_to))
+    show("other presets, against the costs in stages/costs.py", [compared(run, REFERENCE) for run in others])
+    return 0
+
+
+def costs_text(costs: Costs) -> str:
+    """Format costs as in `stages/costs.py`, to three digits."""
+    lines = [f"{name}: {getattr(costs, name):.3g}" for name in ("pairs", "gaussians", "flat")]
+    lines.append(f"keypoints: { {name: round(count) for name, count in costs.keypoints.items()} }")
+    for stage, of in costs.stages.items():
+        lines.append(f'"{stage}": StageCosts({of.cpu:.3g}, {of.resident / 1e6:.0f}e6, {of.memory:.3g}, {of.disk:.3g}),')
+    return "\n".join(lines)
+
+
+def configured(preset: str, differing: Mapping[str, Any] | None = None) -> LineConfig:
+    """Return a preset's options as they were at the time of the run: current ones except for ``differing``."""
+    return resolve(LineConfig, [load_preset(preset), differing or {}])
+
+
+def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[FinishedRun], list[FinishedRun]]:
+    """Split the runs into those of the fitted preset and the others."""
+    runs = [(row["preset"], FinishedRun.of_row(row, configured(row["preset"], row.get("set")))) for row in rows]
+    return [run for preset, run in runs if preset == FITTED_TO], [run for preset, run in runs if preset != FITTED_TO]
+
+
+def holds(outcome: ForecastRatio) -> tuple[bool, bool]:
+    """Whether the forecasts of the whole run's peak memory and CPU time were accurate enough."""
+    bounded = all(ratio >= 1.0 - ROUNDING for ratio in outcome.bounds.values())
+    return abs(outcome.memory - 1.0) <= MEMORY_WITHIN and bounded, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
+
+
+def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
+    """Print the outcomes."""
+    table = []
+    for outcome in outcomes:
+        used = outcome.run.used.values()
+        table.append(
+            {
+                "name": outcome.run.name,
+                "used": max(found["peak_memory_bytes"] for found in used) / 1e6,
+                "memory": outcome.memory,
+                "seconds": sum(found["cpu_seconds"] for found in used),
+                "cpu": outcome.cpu,
+                "disk": outcome.disk,
+                "bound": max(outcome.bounds.values(), default=math.nan),
+                "holds": ""
+                if math.isnan(outcome.memory)
+                else " ".join("yes" if well else "NO" for well in holds(outcome)),
+                **{stage: outcome.stages.get(stage, math.nan) for stage in DISPLAYED_STAGES},
+            }
+        )
+    columns = {
+        "capture": "name",
+        "peak MB": "used:.0f",
+        "memory ×": "memory:.2f",
+        "bound of sparse ×": "bound:.2f",
+        "CPU s": "seconds:.0f",
+        "CPU ×": "cpu:.2f",
+        "disk ×": "disk:.2f",
+        "both hold": "holds",
+    }
+    print_table(title, table, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in DISPLAYED_STAGES})
+
+
+if __name__ == "__main__":
+    sys.exit(main())
