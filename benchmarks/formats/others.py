@@ -1,4 +1,5 @@
-"""Third-party programs that read and write splats, run by node and installed by `npm ci` in `benchmarks/formats/readers`."""
+"""Third-party programs that read and write splats, run by node; `npm ci` in `benchmarks/formats/readers` installs
+them."""
 
 from __future__ import annotations
 
