@@ -1,7 +1,7 @@
 """Cost per unit of work of each stage: constants for forecasts, fitted to finished runs. Light to import.
 
-`python benchmarks forecast --costs` fits and prints them; `benchmarks/line/forecast.json` has the runs, at `preview` with two
-threads on a shared 2-core x86-64 machine with AVX-512. CPU seconds are those of that machine.
+`python benchmarks forecast --costs` fits and prints them; `benchmarks/line/forecast.json` has the runs, at `preview`
+with two threads on a shared 2-core x86-64 machine with AVX-512. CPU seconds are those of that machine.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Third-party programs that read and write splats, run by node and installed by `npm ci` in `benchmarks/formats/readers`."""
+"""Third-party programs that read and write splats, run by node and installed by `npm ci` in `formats/readers`."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ CHILDREN = 4
 BOX_SIGMAS = 3.0
 ERROR_PER_SPREAD = 40.0
 """A node's error per spread of its merged Gaussians, both in world units: at an error of 16 pixels the spread is 0.4
-pixels, where models of different captures are within 32 dB of the full model (`benchmarks/splats/levels.py`). From farther
-away a node is even closer to the full model, but not to its rendering, which omits contributions below an 8-bit step:
-most of a pixel's many Gaussians."""
+pixels, where models of different captures are within 32 dB of the full model (`benchmarks/splats/levels.py`). From
+farther away a node is even closer to the full model, but not to its rendering, which omits contributions below an
+8-bit step: most of a pixel's many Gaussians."""
 LARGE_POWER = 0.5
 """Replaces ``reduction.LARGE_POWER``: all of a node is seen from about the same distance, so what is large in the world
 is large in the image."""
