@@ -13,6 +13,7 @@ import ast
 import os
 import runpy
 import sys
+from itertools import groupby
 from pathlib import Path
 
 HOME = Path(__file__).resolve().parent
@@ -25,10 +26,10 @@ def main(words: list[str]) -> str | None:
     scripts = {path.stem: path for folder in folders for path in sorted(folder.glob("*.py")) if runnable(path)}
     if not words:
         print("python benchmarks NAME ARGUMENT …   (NAME --help: its arguments)")
-        for folder in folders:
+        for folder, paths in groupby(scripts.values(), lambda path: path.parent):
             print(f"\n{folder.name}/")
-            for name in (name for name, path in scripts.items() if path.parent == folder):
-                print(f"  {name:22} {first_sentence(scripts[name])}")
+            for path in paths:
+                print(f"  {path.stem:22} {first_sentence(path)}")
         return None
     name, *arguments = words
     if name not in scripts:

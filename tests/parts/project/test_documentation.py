@@ -141,12 +141,17 @@ def test_every_make_target_and_program_exists(page: Path) -> None:
     inline = [text.split() for text in re.findall(r"`make ([^`]+)`", prose(page))]
     for words in [*command_lines(page, "make"), *inline]:
         assert {word for word in words if "=" not in word} <= targets, words
-    for program, *arguments in command_lines(page, "python"):
+    named = [text.split() for text in re.findall(r"`python (benchmarks [^`]+)`", prose(page))]
+    for program, *arguments in [*command_lines(page, "python"), *command_lines(page, "python3"), *named]:
         if program == "-m":
             continue
-        source = (ROOT / program).read_text(encoding="utf-8")
-        near = "".join(path.read_text(encoding="utf-8") for path in (ROOT / program).parent.glob("*.py"))
-        assert "__main__" in source, program
+        path = ROOT / program
+        folders = [path.parent]
+        if program == "benchmarks":
+            (path,) = path.glob(f"*/{arguments[0]}.py")
+            folders = [path.parent, ROOT / "benchmarks" / "shared"]
+        near = "".join(each.read_text(encoding="utf-8") for folder in folders for each in folder.glob("*.py"))
+        assert "__main__" in path.read_text(encoding="utf-8"), program
         assert all(f'"{word}"' in near for word in arguments if word.startswith("--")), (program, arguments)
 
 
