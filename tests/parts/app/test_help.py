@@ -15,7 +15,8 @@ from repository import ROOT
 from splatpipe.pipeline.app.cli.help import PAGES
 from splatpipe.pipeline.app.cli.main import app
 
-COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+EVERY = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+COMMANDS = {name: command for name, command in EVERY.items() if not command.hidden}  # without former names
 SCREENS = 100  # lines: two screens of a terminal, 80 columns wide
 SENTENCE = 160  # characters
 

@@ -106,7 +106,7 @@ def test_a_device_that_processes_all_cells_leaves_out_the_same(
     an_epoch(robust), an_epoch(other)
     photos = an_epoch(robust)
     monkeypatch.setattr(
-        "splatpipe.pipeline.train.appearance.robust._worth_asking", lambda asked: torch.arange(len(asked))
+        "splatpipe.pipeline.train.appearance.robust._cell_indices", lambda asked: torch.arange(len(asked))
     )
     for number, photo in an_epoch(other).items():
         expected = photos[number].mask
