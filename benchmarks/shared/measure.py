@@ -25,6 +25,7 @@ import numpy as np
 import pycolmap
 import torch
 from ceilings import measure_ceilings
+from commands import benchmark
 from rasterizing import contributing_pairs, raster_alone
 from tables import Row, console, print_table
 
