@@ -122,7 +122,7 @@ def worker_of(running: subprocess.Popen[str], out: Path, but: int = 0) -> int:
         assert running.poll() is None
         if b'"stage_started", "stage": "features"' not in events(out).get("house", b""):
             return 0
-        workers = (child for child, output in descendants(running.pid).items() if "engine.worker" in output)
+        workers = (child for child, output in descendants(running.pid).items() if "engine.runs.worker" in output)
         return next((child for child in workers if child != but), 0)
 
     return wait_until(found, "the stage features")
