@@ -104,9 +104,8 @@ def uncertainty_of(
             which already account for it.
     """
     spread = 2.0 * np.sqrt(2.0 / np.maximum(fit.noise.degrees, 1.0))
-    variance_bound = fit.noise.factors**2 * (
-        1.0 + spread
-    )  # its upper bound: no common error is left if the noise is as stated
+    # Upper bound of the noise's share of the stated variance: no common error is left if the noise is as stated.
+    variance_bound = fit.noise.factors**2 * (1.0 + spread)
     common = stated * np.sqrt(np.maximum(1.0 - variance_bound, 0.0))
     common_3 = common[[0, 0, 1]]
     covariance = fit.covariance
