@@ -6,7 +6,8 @@
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            generates the tables of docs/options.md from the code
 # make rooms-page              generates the graphs and tables of docs/rooms.md and docs/stages.md from the contracts
-# make release                 checks wheel and sdist in clean environments: licences, SBOM, types, the demo's bits
+# make wheel                   makes wheels for other machines in dist/manylinux (PYTHONS=python3.13: for 3.12 and 3.13, too)
+# make release                 checks wheels and sdist in clean environments: licences, SBOM, types, the demo's bits
 # make aarch64                 builds the kernels and their C++ tests for 64-bit Arm, and runs them under QEMU
 # make test-image              builds the container image and runs the demo in it (Linux, root, buildah, runc)
 # make test-docker             builds the image with a Docker daemon of its own, and tries it and the compose file (root)
@@ -26,6 +27,8 @@ TORCH ?=
 NVCC := $(firstword $(shell command -v nvcc) $(wildcard /usr/local/cuda/bin/nvcc))
 SPLATPIPE_CUDA := $(or $(SPLATPIPE_CUDA),$(if $(filter wheel,$(MAKECMDGOALS)),$(if $(NVCC),all,off),auto))
 export SPLATPIPE_CUDA
+# The newest C library that a wheel may require: Ubuntu 22.04's, older than Debian 12's.
+MANYLINUX := manylinux_2_35_$(shell uname -m)
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 SOURCES := $(shell find pipeline stages configs demo -type f -not -path '*/__pycache__/*' \
@@ -235,8 +238,15 @@ types: $(EITHER) .venv/.dev
 layers: $(EITHER) .venv/.dev
 	@$(BIN)/lint-imports
 
-wheel: .venv/.wheel
-	@ls dist/splatpipe-*.whl
+# Wheels for other machines: for this Python, and (PYTHONS=python3.13) one by the stable ABI for all from 3.12 on. Debian
+# 12's GCC gives the released ones: another may give other bits, and may need a newer C++ library.
+wheel: .venv/.wheel .venv/.dev
+	@rm -rf dist/untagged && mkdir -p dist/untagged dist/manylinux && ln dist/splatpipe-*.whl dist/untagged
+	@for python in $(PYTHONS); do $$python -m pip --disable-pip-version-check wheel -q --no-deps -w dist/untagged .; done
+	@for file in dist/untagged/*.whl; do \
+	  PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --plat $(MANYLINUX) --only-plat -w dist/manylinux $$file 2> dist/untagged/log \
+	    || { cat dist/untagged/log; exit 1; }; done
+	@ls dist/manylinux/*.whl
 
 clean:
 	@rm -rf .venv build dist

