@@ -3,7 +3,7 @@
 python benchmarks forecast                       # the table of figures that is kept: fits, leaves one capture out
 python benchmarks forecast --add OUT NAME PRESET # reads a run's manifests (at least to `sparse`) into that table
     --stage sparse --speed 0.5                      # … of one stage only; its machine was half as fast as the reference
-python benchmarks forecast --costs               # prints the fitted costs, for stages/costs.py
+python benchmarks forecast --costs               # prints the fitted costs, for stages/forecast/costs.py
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from forecast_fit import FinishedRun, ForecastRatio, compared, fit, left_out, re
 from tables import print_table
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
-from splatpipe.stages.costs import REFERENCE, Costs
+from splatpipe.stages.forecast.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
 
 TABLE = Path(__file__).with_name("forecast.json")
 FITTED_TO = "preview"  # runs of other presets are reported, not fitted
 MEMORY_WITHIN = 0.3
 CPU_WITHIN = 1.5
-ROUNDING = 0.01  # relative rounding error of the costs in `stages/costs.py`, which have three digits
+ROUNDING = 0.01  # relative rounding error of the costs in `stages/forecast/costs.py`, which have three digits
 DISPLAYED_STAGES = ("features", "matches", "sparse", "initialize", "train")
 
 
@@ -63,16 +63,17 @@ def main() -> int:
         sys.stdout.write(costs_text(fit(fitted_to)) + "\n")
         return 0
     show(f"{FITTED_TO}, each against the costs of the others: forecast over used", left_out(fitted_to))
-    show("other presets, against the costs in stages/costs.py", [compared(run, REFERENCE) for run in others])
+    show("other presets, against the costs in stages/forecast/costs.py", [compared(run, REFERENCE) for run in others])
     return 0
 
 
 def costs_text(costs: Costs) -> str:
-    """Format costs as in `stages/costs.py`, to three digits."""
+    """Format costs as in `stages/forecast/costs.py`, to three digits."""
     lines = [f"{name}: {getattr(costs, name):.3g}" for name in ("pairs", "gaussians", "flat")]
     lines.append(f"keypoints: { {name: round(count) for name, count in costs.keypoints.items()} }")
     for stage, of in costs.stages.items():
-        lines.append(f'"{stage}": StageCosts({of.cpu:.3g}, {of.resident / 1e6:.0f}e6, {of.memory:.3g}, {of.disk:.3g}),')
+        memory, disk = next(iter(of.memory.values()), 0.0), next(iter(of.disk.values()))
+        lines.append(f"{stage}: {of.cpu:.3g}, {of.resident / 1e6:.0f}e6, {memory:.3g}, {disk:.3g}")
     return "\n".join(lines)
 
 
