@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from forecast_fit import FinishedRun, ForecastRatio, compared, fit, left_out, read_run
+from forecast_fit import FinishedRun, compared, fit, left_out, read_run
 from tables import print_table
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
@@ -62,8 +62,10 @@ def main() -> int:
     if options.costs:
         sys.stdout.write(costs_text(fit(fitted_to)) + "\n")
         return 0
-    show(f"{FITTED_TO}, each against the costs of the others: forecast over used", left_out(fitted_to))
-    show("other presets, against the costs in stages/forecast/costs.py", [compared(run, REFERENCE) for run in others])
+    show(f"{FITTED_TO}, each against the costs of the others: forecast over used", fitted_to, left_out(fitted_to))
+    if others:
+        title = "other presets, against the costs in stages/forecast/costs.py"
+        show(title, others, [compared(run, REFERENCE) for run in others])
     return 0
 
 
@@ -88,43 +90,30 @@ def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[FinishedRun], list[Fin
     return [run for preset, run in runs if preset == FITTED_TO], [run for preset, run in runs if preset != FITTED_TO]
 
 
-def holds(outcome: ForecastRatio) -> tuple[bool, bool]:
+def holds(ratios: Mapping[str, float]) -> tuple[bool, bool]:
     """Whether the forecasts of the whole run's peak memory and CPU time were accurate enough."""
-    bounded = all(ratio >= 1.0 - ROUNDING for ratio in outcome.bounds.values())
-    return abs(outcome.memory - 1.0) <= MEMORY_WITHIN and bounded, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
+    is_bound = not ratios["bound"] < 1.0 - ROUNDING
+    return abs(ratios["memory"] - 1.0) <= MEMORY_WITHIN and is_bound, 1.0 / CPU_WITHIN <= ratios["cpu"] <= CPU_WITHIN
 
 
-def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
+def show(title: str, runs: Sequence[FinishedRun], outcomes: Sequence[Mapping[str, float]]) -> None:
     """Print the outcomes."""
-    table = []
-    for outcome in outcomes:
-        used = outcome.run.used.values()
-        table.append(
-            {
-                "name": outcome.run.name,
-                "used": max(found["peak_memory_bytes"] for found in used) / 1e6,
-                "memory": outcome.memory,
-                "seconds": sum(found["cpu_seconds"] for found in used),
-                "cpu": outcome.cpu,
-                "disk": outcome.disk,
-                "bound": max(outcome.bounds.values(), default=math.nan),
-                "holds": ""
-                if math.isnan(outcome.memory)
-                else " ".join("yes" if well else "NO" for well in holds(outcome)),
-                **{stage: outcome.stages.get(stage, math.nan) for stage in DISPLAYED_STAGES},
-            }
-        )
-    columns = {
-        "capture": "name",
-        "peak MB": "used:.0f",
-        "memory ×": "memory:.2f",
-        "bound of sparse ×": "bound:.2f",
-        "CPU s": "seconds:.0f",
-        "CPU ×": "cpu:.2f",
-        "disk ×": "disk:.2f",
-        "both hold": "holds",
-    }
-    print_table(title, table, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in DISPLAYED_STAGES})
+    rows = [
+        {
+            **dict.fromkeys(DISPLAYED_STAGES, math.nan),
+            **ratios,
+            "name": run.name,
+            "used": max(found["peak_memory_bytes"] for found in run.used.values()) / 1e6,
+            "seconds": sum(found["cpu_seconds"] for found in run.used.values()),
+            "holds": ""
+            if math.isnan(ratios["memory"])
+            else " ".join("yes" if well else "NO" for well in holds(ratios)),
+        }
+        for run, ratios in zip(runs, outcomes, strict=True)
+    ]
+    columns = {"capture": "name", "peak MB": "used:.0f", "memory ×": "memory:.2f", "bound of sparse ×": "bound:.2f"}
+    columns |= {"CPU s": "seconds:.0f", "CPU ×": "cpu:.2f", "disk ×": "disk:.2f", "both hold": "holds"}
+    print_table(title, rows, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in DISPLAYED_STAGES})
 
 
 if __name__ == "__main__":

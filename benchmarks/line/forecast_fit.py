@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -197,46 +197,25 @@ def _line(units: Float64[np.ndarray, " n"], taken: Float64[np.ndarray, " n"]) ->
     return float(constant), float(slope / units.max())
 
 
-@dataclass(frozen=True)
-class ForecastRatio:
-    """A run beside its forecast: forecast over actual use.
+def compared(run: FinishedRun, costs: Costs) -> dict[str, float]:
+    """Return the ratios of a run's forecast by these costs to its actual use.
 
-    Attributes:
-        run: The run.
-        memory: Ratio of the whole run's peak, without the stages of ``BOUNDS``; NaN if only these were recorded.
-        cpu: Ratio of the CPU time of all recorded stages.
-        disk: Ratio of all remaining output.
-        stages: Ratios of the CPU time of single stages.
-        bounds: Ratios of the memory of those of ``BOUNDS``.
+    ``memory`` is of the whole run's peak, without the stages of ``BOUNDS``, whose own memory is ``bound`` (NaN without
+    any); ``cpu`` and ``disk`` are of all recorded stages, and those by a stage's name of its CPU time.
     """
-
-    run: FinishedRun
-    memory: float
-    cpu: float
-    disk: float
-    stages: Mapping[str, float]
-    bounds: Mapping[str, float]
-
-
-def compared(run: FinishedRun, costs: Costs) -> ForecastRatio:
-    """Return the ratios of a run's forecast by these costs to its actual use."""
-    needs = forecast_of(run, costs).needs(1.0)
-    used, bounded = run.used, [stage for stage in BOUNDS if stage in run.used]
-    typical = [stage for stage in used if stage not in BOUNDS]
-
-    def ratio(join: Callable[[Iterable[float]], float], predicted: Mapping[str, float], kind: str) -> float:
-        return math.nan if not predicted else join(predicted.values()) / join(used[stage][kind] for stage in predicted)
-
-    return ForecastRatio(
-        run,
-        ratio(max, {stage: float(needs[stage].memory_bytes) for stage in typical}, "peak_memory_bytes"),
-        ratio(sum, {stage: needs[stage].cpu_seconds for stage in used}, "cpu_seconds"),
-        ratio(sum, {stage: float(needs[stage].disk_bytes) for stage in used}, "disk_bytes"),
-        {stage: needs[stage].cpu_seconds / max(used[stage]["cpu_seconds"], 0.01) for stage in used},
-        {stage: needs[stage].memory_bytes / used[stage]["peak_memory_bytes"] for stage in bounded},
-    )
+    needs, used = forecast_of(run, costs).needs(1.0), run.used
+    typical, bounds = used.keys() - set(BOUNDS), [stage for stage in BOUNDS if stage in used]
+    memory = {stage: (needs[stage].memory_bytes, used[stage]["peak_memory_bytes"]) for stage in used}
+    forecast_peak, peak = (max((memory[stage][k] for stage in typical), default=math.nan) for k in (0, 1))
+    return {
+        "memory": forecast_peak / peak,
+        "cpu": sum(needs[stage].cpu_seconds for stage in used) / sum(each["cpu_seconds"] for each in used.values()),
+        "disk": sum(needs[stage].disk_bytes for stage in used) / sum(each["disk_bytes"] for each in used.values()),
+        "bound": min((memory[stage][0] / memory[stage][1] for stage in bounds), default=math.nan),
+        **{stage: needs[stage].cpu_seconds / max(used[stage]["cpu_seconds"], 0.01) for stage in used},
+    }
 
 
-def left_out(runs: Sequence[FinishedRun]) -> list[ForecastRatio]:
+def left_out(runs: Sequence[FinishedRun]) -> list[dict[str, float]]:
     """Compare each run with costs fitted to the other captures."""
     return [compared(run, fit([other for other in runs if other.name != run.name])) for run in runs]

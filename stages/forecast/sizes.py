@@ -24,16 +24,9 @@ TARGETS_TILE = 2.4  # megapixels of a tile in which targets are searched
 
 
 def sizes_of(size: CaptureSize, config: LineConfig, threads: int, costs: Costs, training: Training) -> Sizes:
-    """Return the sizes of a run, by name.
+    """Return the sizes of a run, by name; the arguments are those of ``RunForecast``.
 
     Pixels are in millions and of all photos, but for those that the threads hold `at_once`.
-
-    Args:
-        size: The capture's size.
-        config: The resolved options.
-        threads: Number of threads of the run.
-        costs: Has the keypoints and pairs of a typical scene.
-        training: The expected training.
     """
     photos, dataset, extractor = float(size.photos), training.size.megapixels, config.features.extractor
     searched = min(size.megapixels, size.shape * config.features.max_image_size**2 / MEGA)
@@ -76,29 +69,25 @@ def sizes_of(size: CaptureSize, config: LineConfig, threads: int, costs: Costs, 
 
 def _training_sizes(training: Training, flat: float) -> Sizes:
     """Sizes of the training of the whole scene, or of the coarse pass and the blocks; memory is an upper bound."""
-    config, division, gaussians, photos = training.config, training.division, training.gaussians, training.size.photos
+    config, division, gaussians = training.config, training.division, training.gaussians
+    trained, frozen, coarse = gaussians, 0, 0.0
+    if division is not None:
+        trained, coarse = training.block_gaussians(division), min(float(division.coarse_cap), gaussians)
+        frozen = min(division.need.frozen, int(coarse))
     ends_flat = config.stop_when_flat and not config.time_budget_s and division is None
     iterations = sum(count for _level, count in training.finer) * (flat if ends_flat else 1.0)
-    found = {
-        **training.of_process(iterations, int(gaussians), share=training.share),
-        "gaussians": gaussians,
-        "written": gaussians,  # Gaussians, of blocks as well
-        "cached": training.photos_per_block * training.megapixels,  # pixels of decoded photos on disk
-        **dict.fromkeys(("coarse", "coarse_bytes", "coarse_work", "coarse_cached"), 0.0),
-    }
-    if division is None:
-        return found
-    trained, coarse = training.block_gaussians(division), min(float(division.coarse_cap), gaussians)
+    of_one = training.of_process(iterations, int(trained), frozen, training.share)
     of_coarse = training.of_process(sum(count for _level, count in training.coarse), int(coarse))
     return {
-        **found,
-        **training.of_process(iterations, int(trained), min(division.need.frozen, int(coarse)), training.share),
-        "training_bytes": division.need.memory_bytes,
-        "written": gaussians + division.blocks * trained,
-        "coarse": coarse,
-        "coarse_bytes": of_coarse["training_bytes"],
+        **of_one,
+        "training_bytes": of_one["training_bytes"] if division is None else division.need.memory_bytes,
+        "gaussians": gaussians,
+        "written": gaussians + (0.0 if division is None else division.blocks * trained),  # Gaussians
+        "cached": training.photos_per_block * training.megapixels,  # pixels of decoded photos on disk
+        "coarse": coarse,  # Gaussians
         "coarse_work": of_coarse["work"],
-        "coarse_cached": sum(photos * training.megapixels / 4**level for level, _count in training.coarse[:1]),
+        "coarse_bytes": of_coarse["training_bytes"],
+        "coarse_cached": sum(training.size.photos * training.megapixels / 4**level for level, _ in training.coarse),
     }
 
 
