@@ -14,7 +14,6 @@ from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.machine import available_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.options import UndistortConfig
 from splatpipe.pipeline.photos.pixels.dataset import load_split, load_views
 from splatpipe.pipeline.raster.device import Device, choose_device
 from splatpipe.pipeline.splat.containers.ply import read_splat_header
@@ -27,11 +26,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS
 from splatpipe.pipeline.train.plan.limits import LIBRARIES_BYTES
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
-from splatpipe.stages.costs import REFERENCE
-from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import MEGA, CaptureSize, CaptureWork
-
-MAX_PHOTO_MEGAPIXELS = 200.0  # practically no limit: the dataset's own size decides
+from splatpipe.stages.forecast.training import MEGA, CaptureSize, Training
 
 
 def run(config: BlocksConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -136,8 +131,7 @@ def _scene(train: TrainConfig, plan: TrainingPlan) -> SceneSize:
     photos = sum(count for _width, _height, count in plan.sizes)
     pixels = sum(width * height * count for width, height, count in plan.sizes) / max(photos, 1)
     size = CaptureSize(photos, pixels / MEGA, True, _shape(plan))
-    whole = LineConfig(train=train, undistort=UndistortConfig(max_megapixels=MAX_PHOTO_MEGAPIXELS))
-    expected = CaptureWork.of(size, whole, REFERENCE, threads=1).grown
+    expected = Training.of(size, train).as_divided().grown
     return SceneSize(train.max_gaussians, expected, window, train.sh_degree, photos)
 
 

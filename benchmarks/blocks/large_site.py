@@ -35,11 +35,10 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine, Shard
 from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.train.blocks.cells.site_plan import SitePlan
 from splatpipe.pipeline.train.blocks.layout import COARSE, PROSPECTS, lay_out
-from splatpipe.stages.costs import REFERENCE
-from splatpipe.stages.forecast import machine_speed, needs_of, needs_of_blocks
+from splatpipe.stages.forecast.needs import RunForecast, machine_speed
+from splatpipe.stages.forecast.training import MEGA, CaptureSize
 from splatpipe.stages.line import TRAIN
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import MEGA, CaptureSize, CaptureWork
 
 POLL_S = 0.5
 COLUMNS = {
@@ -196,11 +195,14 @@ def main() -> None:
     sizes = [view.camera.width * view.camera.height for view in run.views]
     size = CaptureSize(tiling.photos, sum(sizes) / len(sizes) / MEGA, positions=True)
     speed = machine_speed()
-    work = CaptureWork.of(size, config, REFERENCE, arguments.threads)
-    needs = needs_of(work, speed)
-    if work.blocks is None:
+    whole_run = RunForecast.of(size, config, arguments.threads)
+    needs, division = whole_run.needs(speed), whole_run.training.division
+    if division is None:
         options.exit(2, "That much memory holds the site in one: lower --max-memory, or raise --gaussians.\n")
-    print(f"{tiling.photos:,} photos in {len(tiling.offsets)} tiles, {blocks_text(work.blocks)}; machine {speed:.2f}")
+    print(
+        f"{tiling.photos:,} photos in {len(tiling.offsets)} tiles, {blocks_text(whole_run.training, division)}; "
+        f"machine {speed:.2f}"
+    )
     _report_whole(needs)
     if arguments.forecast_only:
         return
@@ -208,11 +210,11 @@ def main() -> None:
     began = time.process_time()
     parts = write_site(tiling, arguments.work)
     coarse = arguments.work / COARSE
-    write_coarse(tiling, work.blocks.division.coarse_cap, coarse, arguments.threads)
+    write_coarse(tiling, division.coarse_cap, coarse, arguments.threads)
     inputs = Inputs(parts, arguments.work, machine=Machine("cpu", arguments.threads))
     shutil.rmtree(arguments.work / PROSPECTS, ignore_errors=True)
     (arguments.work / PROSPECTS).mkdir()
-    site, forecast = lay_out(config.train, inputs, work.blocks.division, arguments.work, WarningReporter())
+    site, forecast = lay_out(config.train, inputs, division, arguments.work, WarningReporter())
     (arguments.work / "blocks.json").write_text(site.to_json(), encoding="utf-8")
     print(
         f"{len(load_views(parts['undistort.dataset'])):,} photos laid out and cut: {time.process_time() - began:.0f} s"
@@ -222,7 +224,7 @@ def main() -> None:
     of_blocks = forecast["of_blocks"]
     print(f"photos a block: {of_blocks['photos']}; iterations: {of_blocks['iterations']}")
     print(f"Gaussians that each begins with: {of_blocks['start']}; around it: {of_blocks['frozen']}")
-    own = needs_of_blocks(work, of_blocks, speed)
+    own = whole_run.needs_of_blocks(of_blocks, speed)
     rows = []
     for place, block in zip(("middle", "edge"), middle_and_edge(site.partition.cells), strict=True):
         took = trained(block + 1, site, parts, config, arguments.work, arguments.threads)

@@ -3,7 +3,7 @@
 python benchmarks forecast                       # the table of figures that is kept: fits, leaves one capture out
 python benchmarks forecast --add OUT NAME PRESET # reads a run's manifests (at least to `sparse`) into that table
     --stage sparse --speed 0.5                      # … of one stage only; its machine was half as fast as the reference
-python benchmarks forecast --costs               # prints the fitted costs, for stages/costs.py
+python benchmarks forecast --costs               # prints the fitted costs, for stages/forecast/costs.py
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from forecast_fit import FinishedRun, ForecastRatio, compared, fit, left_out, read_run
+from forecast_fit import FinishedRun, compared, fit, left_out, read_run
 from tables import print_table
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
-from splatpipe.stages.costs import REFERENCE, Costs
+from splatpipe.stages.forecast.costs import REFERENCE, Costs
 from splatpipe.stages.options import LineConfig
 
 TABLE = Path(__file__).with_name("forecast.json")
 FITTED_TO = "preview"  # runs of other presets are reported, not fitted
 MEMORY_WITHIN = 0.3
 CPU_WITHIN = 1.5
-ROUNDING = 0.01  # relative rounding error of the costs in `stages/costs.py`, which have three digits
+ROUNDING = 0.01  # relative rounding error of the costs in `stages/forecast/costs.py`, which have three digits
 DISPLAYED_STAGES = ("features", "matches", "sparse", "initialize", "train")
 
 
@@ -62,17 +62,20 @@ def main() -> int:
     if options.costs:
         sys.stdout.write(costs_text(fit(fitted_to)) + "\n")
         return 0
-    show(f"{FITTED_TO}, each against the costs of the others: forecast over used", left_out(fitted_to))
-    show("other presets, against the costs in stages/costs.py", [compared(run, REFERENCE) for run in others])
+    show(f"{FITTED_TO}, each against the costs of the others: forecast over used", fitted_to, left_out(fitted_to))
+    if others:
+        title = "other presets, against the costs in stages/forecast/costs.py"
+        show(title, others, [compared(run, REFERENCE) for run in others])
     return 0
 
 
 def costs_text(costs: Costs) -> str:
-    """Format costs as in `stages/costs.py`, to three digits."""
+    """Format costs as in `stages/forecast/costs.py`, to three digits."""
     lines = [f"{name}: {getattr(costs, name):.3g}" for name in ("pairs", "gaussians", "flat")]
     lines.append(f"keypoints: { {name: round(count) for name, count in costs.keypoints.items()} }")
     for stage, of in costs.stages.items():
-        lines.append(f'"{stage}": StageCosts({of.cpu:.3g}, {of.resident / 1e6:.0f}e6, {of.memory:.3g}, {of.disk:.3g}),')
+        memory, disk = next(iter(of.memory.values()), 0.0), next(iter(of.disk.values()))
+        lines.append(f"{stage}: {of.cpu:.3g}, {of.resident / 1e6:.0f}e6, {memory:.3g}, {disk:.3g}")
     return "\n".join(lines)
 
 
@@ -87,43 +90,30 @@ def runs_of(rows: Sequence[dict[str, Any]]) -> tuple[list[FinishedRun], list[Fin
     return [run for preset, run in runs if preset == FITTED_TO], [run for preset, run in runs if preset != FITTED_TO]
 
 
-def holds(outcome: ForecastRatio) -> tuple[bool, bool]:
+def holds(ratios: Mapping[str, float]) -> tuple[bool, bool]:
     """Whether the forecasts of the whole run's peak memory and CPU time were accurate enough."""
-    bounded = all(ratio >= 1.0 - ROUNDING for ratio in outcome.bounds.values())
-    return abs(outcome.memory - 1.0) <= MEMORY_WITHIN and bounded, 1.0 / CPU_WITHIN <= outcome.cpu <= CPU_WITHIN
+    is_bound = not ratios["bound"] < 1.0 - ROUNDING
+    return abs(ratios["memory"] - 1.0) <= MEMORY_WITHIN and is_bound, 1.0 / CPU_WITHIN <= ratios["cpu"] <= CPU_WITHIN
 
 
-def show(title: str, outcomes: Sequence[ForecastRatio]) -> None:
+def show(title: str, runs: Sequence[FinishedRun], outcomes: Sequence[Mapping[str, float]]) -> None:
     """Print the outcomes."""
-    table = []
-    for outcome in outcomes:
-        used = outcome.run.used.values()
-        table.append(
-            {
-                "name": outcome.run.name,
-                "used": max(found["peak_memory_bytes"] for found in used) / 1e6,
-                "memory": outcome.memory,
-                "seconds": sum(found["cpu_seconds"] for found in used),
-                "cpu": outcome.cpu,
-                "disk": outcome.disk,
-                "bound": max(outcome.bounds.values(), default=math.nan),
-                "holds": ""
-                if math.isnan(outcome.memory)
-                else " ".join("yes" if well else "NO" for well in holds(outcome)),
-                **{stage: outcome.stages.get(stage, math.nan) for stage in DISPLAYED_STAGES},
-            }
-        )
-    columns = {
-        "capture": "name",
-        "peak MB": "used:.0f",
-        "memory ×": "memory:.2f",
-        "bound of sparse ×": "bound:.2f",
-        "CPU s": "seconds:.0f",
-        "CPU ×": "cpu:.2f",
-        "disk ×": "disk:.2f",
-        "both hold": "holds",
-    }
-    print_table(title, table, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in DISPLAYED_STAGES})
+    rows = [
+        {
+            **dict.fromkeys(DISPLAYED_STAGES, math.nan),
+            **ratios,
+            "name": run.name,
+            "used": max(found["peak_memory_bytes"] for found in run.used.values()) / 1e6,
+            "seconds": sum(found["cpu_seconds"] for found in run.used.values()),
+            "holds": ""
+            if math.isnan(ratios["memory"])
+            else " ".join("yes" if well else "NO" for well in holds(ratios)),
+        }
+        for run, ratios in zip(runs, outcomes, strict=True)
+    ]
+    columns = {"capture": "name", "peak MB": "used:.0f", "memory ×": "memory:.2f", "bound of sparse ×": "bound:.2f"}
+    columns |= {"CPU s": "seconds:.0f", "CPU ×": "cpu:.2f", "disk ×": "disk:.2f", "both hold": "holds"}
+    print_table(title, rows, columns | {f"{stage} CPU ×": f"{stage}:.2f" for stage in DISPLAYED_STAGES})
 
 
 if __name__ == "__main__":

@@ -4,32 +4,31 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.optimize import nnls
 
-from splatpipe.stages.costs import REFERENCE, Costs, StageCosts
-from splatpipe.stages.forecast import capture_size, forecast
+from splatpipe.stages.forecast.costs import REFERENCE, Costs, Sizes, StageCosts, total
+from splatpipe.stages.forecast.needs import RunForecast, capture_size
+from splatpipe.stages.forecast.training import CaptureSize
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import NEIGHBOURS, CaptureSize, CaptureWork, WorkUnits
 
 KINDS = ("cpu_seconds", "peak_memory_bytes", "disk_bytes")
-BY_GAUSSIANS = ("train", "clean", "evaluate", "export")
+BY_GAUSSIANS = ("clean", "evaluate", "export")
 """Stages whose memory grows with the Gaussians, of which runs at `preview` have too few to show how: the memory per
-Gaussian is counted in training (`train/plan/limits.py`), and was measured on seneca's 325,000 in the later stages."""
+Gaussian was measured on seneca's 325,000."""
 
 SELDOM = ("control", "targets", "blocks")
 """Stages that have nothing to do for most captures, so nothing is fitted to them."""
 
 BY_HAND = ("matches", "train")
 """Stages whose memory is not fitted. Matching runs in its own processes; two of them took 346 to 388 MB on the demo,
-beside 250 of the stage itself. Training's value dates from before its frames were freed early; two runs since then say
-0.31 GB, but with few Gaussians, and memory limits rely on it."""
-
+beside 250 of the stage itself. Training's is the arithmetic of its own limits."""
 
 BOUNDS = ("sparse",)
 """Stages whose memory is bounded from above: mapping takes much more if it leaves photos to the ladder, which matches
@@ -110,129 +109,113 @@ def _used(manifest: Mapping[str, Any]) -> dict[str, float]:
 
 
 def fit(runs: Sequence[FinishedRun], base: Costs = REFERENCE) -> Costs:
-    """Fit the costs to these runs: typical properties of scenes, and the cost per unit of their work.
+    """Fit the costs to these runs: typical properties of scenes, and the costs of the stages by their sizes.
 
     What these runs do not cover (an extractor that none used, a flythrough) is taken from ``base``.
     """
     scenes = [scene_of(run, base) for run in runs]
-    works = [CaptureWork.of(run.size, run.config, scene, run.threads) for run, scene in zip(runs, scenes, strict=True)]
-    units = [work.units() for work in works]
-    keypoints = dict(base.keypoints)
-    for extractor in {run.config.features.extractor for run in runs}:
-        counts = [scene.keypoints[extractor] for run, scene in zip(runs, scenes, strict=True) if _uses(run, extractor)]
-        keypoints[extractor] = _typical(counts, 0.0)
-    chosen = [scene.pairs for run, scene in zip(runs, scenes, strict=True) if run.counts["pairs"] < _every(run)]
-    trained = [(run, scene) for run, scene in zip(runs, scenes, strict=True) if "gaussians" in run.counts]
-    ended = [scene.flat for run, scene in trained if run.config.train.stop_when_flat]
-    stages = {}
-    for stage, otherwise in base.stages.items():
-        those = [(run.used[stage], each[stage]) for run, each in zip(runs, units, strict=True) if stage in run.used]
-        if those:
-            resident, memory = otherwise.resident, otherwise.memory
-            if stage in BOUNDS:
-                memory = max(0.0, *(_beyond(used, of, resident) / of.memory for used, of in those))
-            elif stage not in BY_HAND:
-                resident, memory = _line(those, memory if stage in BY_GAUSSIANS else None)
-            cpu = [used["cpu_seconds"] / of.cpu for used, of in those if used["cpu_seconds"] * of.cpu > 0.0]
-            disk = [used["disk_bytes"] / of.disk for used, of in those if used["disk_bytes"] * of.disk > 0.0]
-            found = _typical(cpu, otherwise.cpu), _typical(disk, otherwise.disk)
-            stages[stage] = StageCosts(found[0], resident, memory, found[1])
-        else:
-            stages[stage] = otherwise
+    sizes = [forecast_of(run, scene).sizes for run, scene in zip(runs, scenes, strict=True)]
+    each = list(zip(runs, scenes, strict=True))
+    stages = dict(base.stages)
+    for stage in stages.keys() - set(SELDOM):
+        of_stage = [(run.used[stage], own) for run, own in zip(runs, sizes, strict=True) if stage in run.used]
+        if of_stage:
+            stages[stage] = _fit_stage(stage, of_stage, base.stages[stage])
+    stages["blocks"] = replace(stages["blocks"], cpu=stages["train"].cpu)
+    extractors = {run.config.features.extractor for run in runs}
+    keypoints = {
+        name: _typical([scene.keypoints[name] for run, scene in each if run.config.features.extractor == name])
+        for name in extractors
+    }
+    trained = [scene for run, scene in each if "gaussians" in run.counts]
     return Costs(
-        keypoints,
-        _typical(chosen, base.pairs),
-        _typical([scene.gaussians for _run, scene in trained], base.gaussians),
-        _typical(ended, base.flat),
-        stages,
+        keypoints={**base.keypoints, **keypoints},
+        pairs=_typical([scene.pairs for run, scene in each if run.counts["pairs"] < _every(run)]),
+        gaussians=_typical([scene.gaussians for scene in trained]),
+        flat=_typical([scene.flat for scene in trained]),
+        stages=stages,
     )
 
 
+def forecast_of(run: FinishedRun, costs: Costs) -> RunForecast:
+    """Return the forecast of a run by these costs."""
+    return RunForecast.of(run.size, run.config, run.threads, costs=costs)
+
+
 def scene_of(run: FinishedRun, base: Costs) -> Costs:
-    """Replace typical scene properties by this run's, known only afterwards, so that its units of work are exact."""
-    bare = CaptureWork.of(run.size, run.config, replace(base, gaussians=1.0), run.threads)
-    options, counts = run.config, run.counts
-    keypoints = {
-        **base.keypoints,
-        options.features.extractor: counts["keypoints"] / run.size.photos / bare.keypoint_megapixels,
-    }
-    pairs = counts["pairs"] / run.size.photos * NEIGHBOURS / options.matches.neighbours
-    placed = replace(base, keypoints=keypoints, pairs=pairs)
+    """Replace typical scene properties by this run's, known only afterwards, so that its sizes are exact."""
+    extractor, counts = run.config.features.extractor, run.counts
+    bare = forecast_of(run, replace(base, keypoints={extractor: 1.0}, pairs=1.0, gaussians=1.0))
+    ratio = {name: counts[name] / bare.sizes[name] for name in ("keypoints", "pairs")}
+    scene = replace(base, keypoints={**base.keypoints, extractor: ratio["keypoints"]}, pairs=ratio["pairs"])
     if "gaussians" not in counts:
-        return placed
-    return replace(placed, gaussians=counts["gaussians"] / bare.grown, flat=counts["iterations"] / bare.iterations)
+        return scene
+    training = bare.training
+    return replace(
+        scene, gaussians=counts["gaussians"] / training.grown, flat=counts["iterations"] / training.iterations
+    )
 
 
-def _beyond(used: Mapping[str, float], of: WorkUnits, resident: float) -> float:
-    """Bytes of a stage's memory beyond what is constant or known."""
-    return used["peak_memory_bytes"] - resident - of.fixed_bytes
+def _fit_stage(stage: str, of_stage: Sequence[tuple[Mapping[str, float], Sizes]], base: StageCosts) -> StageCosts:
+    """Fit a stage's CPU time, the first terms of its memory and disk space, and its resident memory."""
 
+    def typical(kind: str, units: Sequence[float], otherwise: float) -> float:
+        each = [used[kind] / unit for (used, _), unit in zip(of_stage, units, strict=True) if used[kind] * unit > 0.0]
+        return _typical(each) if each else otherwise
 
-def _uses(run: FinishedRun, extractor: str) -> bool:
-    return run.config.features.extractor == extractor
+    cpu = typical("cpu_seconds", [base.work(sizes) for _, sizes in of_stage], base.cpu)
+    (on_disk, of_one), *more = base.disk.items()
+    disk = {on_disk: typical("disk_bytes", [sizes[on_disk] for _, sizes in of_stage], of_one), **dict(more)}
+    fitted = replace(base, cpu=cpu, disk=disk)
+    if stage in BY_HAND:
+        return fitted
+    (by, slope), *others = base.memory.items() or [("photos", 0.0)]
+    rest = dict(others)
+    units = np.array([sizes[by] for _, sizes in of_stage])
+    taken = np.array([used["peak_memory_bytes"] - total(rest, sizes) for used, sizes in of_stage])
+    if stage in BOUNDS:
+        return replace(fitted, memory={by: float(((taken - base.resident) / units).max()), **rest})
+    if stage in BY_GAUSSIANS or not base.memory:
+        return replace(fitted, resident=float((taken - slope * units).mean()))
+    resident, slope = _line(units, taken)
+    return replace(fitted, resident=resident, memory={by: slope, **rest})
 
 
 def _every(run: FinishedRun) -> float:
     return run.size.photos * (run.size.photos - 1) / 2
 
 
-def _typical(values: Sequence[float], otherwise: float) -> float:
+def _typical(values: Sequence[float]) -> float:
     """Return the geometric mean: as often too high as too low by the same factor."""
-    return math.exp(sum(math.log(value) for value in values) / len(values)) if values else otherwise
+    return math.exp(sum(math.log(value) for value in values) / len(values))
 
 
-def _line(those: Sequence[tuple[Mapping[str, float], WorkUnits]], slope: float | None = None) -> tuple[float, float]:
-    """Fit a stage's memory: a constant and a cost per unit, neither negative (relative least squares)."""
-    units = np.array([of.memory for _, of in those])
-    used = np.array([found["peak_memory_bytes"] for found, _ in those])
-    if slope is not None:
-        return float(np.mean(used - slope * units)), slope
-    scale = max(float(units.max()), 1.0)
-    table = np.stack([np.ones(len(those)), units / scale], axis=1) * (used.mean() / used)[:, None]
-    constant, slope = nnls(table, np.ones(len(those)))[0] * used.mean()
-    return float(constant), float(slope / scale)
+def _line(units: Float64[np.ndarray, " n"], taken: Float64[np.ndarray, " n"]) -> tuple[float, float]:
+    """Fit a constant and a slope, neither negative (relative least squares)."""
+    table = np.stack([np.ones(len(units)), units / units.max()], axis=1) * (taken.mean() / taken)[:, None]
+    constant, slope = nnls(table, np.ones(len(units)))[0] * taken.mean()
+    return float(constant), float(slope / units.max())
 
 
-@dataclass(frozen=True)
-class ForecastRatio:
-    """A run beside its forecast: forecast over actual use.
+def compared(run: FinishedRun, costs: Costs) -> dict[str, float]:
+    """Return the ratios of a run's forecast by these costs to its actual use.
 
-    Attributes:
-        run: The run.
-        memory: Ratio of the whole run's peak, without the stages of ``BOUNDS``; NaN if only these were recorded.
-        cpu: Ratio of the CPU time of all recorded stages.
-        disk: Ratio of all remaining output.
-        stages: Ratios of the CPU time of single stages.
-        bounds: Ratios of the memory of those of ``BOUNDS``.
+    ``memory`` is of the whole run's peak, without the stages of ``BOUNDS``, whose own memory is ``bound`` (NaN without
+    any); ``cpu`` and ``disk`` are of all recorded stages, and those by a stage's name of its CPU time.
     """
-
-    run: FinishedRun
-    memory: float
-    cpu: float
-    disk: float
-    stages: Mapping[str, float]
-    bounds: Mapping[str, float]
-
-
-def compared(run: FinishedRun, costs: Costs) -> ForecastRatio:
-    """Return the ratios of a run's forecast by these costs to its actual use."""
-    needs = forecast(run.size, run.config, run.threads, costs=costs)
-    used, bounded = run.used, [stage for stage in BOUNDS if stage in run.used]
-    typical = [stage for stage in used if stage not in BOUNDS]
-
-    def ratio(join: Callable[[Iterable[float]], float], predicted: Mapping[str, float], kind: str) -> float:
-        return math.nan if not predicted else join(predicted.values()) / join(used[stage][kind] for stage in predicted)
-
-    return ForecastRatio(
-        run,
-        ratio(max, {stage: float(needs[stage].memory_bytes) for stage in typical}, "peak_memory_bytes"),
-        ratio(sum, {stage: needs[stage].cpu_seconds for stage in used}, "cpu_seconds"),
-        ratio(sum, {stage: float(needs[stage].disk_bytes) for stage in used}, "disk_bytes"),
-        {stage: needs[stage].cpu_seconds / max(used[stage]["cpu_seconds"], 0.01) for stage in used},
-        {stage: needs[stage].memory_bytes / used[stage]["peak_memory_bytes"] for stage in bounded},
-    )
+    needs, used = forecast_of(run, costs).needs(1.0), run.used
+    typical, bounds = used.keys() - set(BOUNDS), [stage for stage in BOUNDS if stage in used]
+    memory = {stage: (needs[stage].memory_bytes, used[stage]["peak_memory_bytes"]) for stage in used}
+    forecast_peak, peak = (max((memory[stage][k] for stage in typical), default=math.nan) for k in (0, 1))
+    return {
+        "memory": forecast_peak / peak,
+        "cpu": sum(needs[stage].cpu_seconds for stage in used) / sum(each["cpu_seconds"] for each in used.values()),
+        "disk": sum(needs[stage].disk_bytes for stage in used) / sum(each["disk_bytes"] for each in used.values()),
+        "bound": min((memory[stage][0] / memory[stage][1] for stage in bounds), default=math.nan),
+        **{stage: needs[stage].cpu_seconds / max(used[stage]["cpu_seconds"], 0.01) for stage in used},
+    }
 
 
-def left_out(runs: Sequence[FinishedRun]) -> list[ForecastRatio]:
+def left_out(runs: Sequence[FinishedRun]) -> list[dict[str, float]]:
     """Compare each run with costs fitted to the other captures."""
     return [compared(run, fit([other for other in runs if other.name != run.name])) for run in runs]

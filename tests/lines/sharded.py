@@ -111,15 +111,19 @@ class Forecaster:
     threads: int
 
     def __call__(self, _summaries: Mapping[str, Summary]) -> Mapping[str, Need]:
-        return forecast(None, self.config)
+        return RunForecast.of(None, self.config).needs(1.0)
 
 
-def forecast(
-    _size: object, config: LineConfig, _threads: int = 1, *, speed: float = 1.0, machine_bytes: int = 0
-) -> dict[str, Need]:
+class RunForecast:
     """A hundred million bytes a stage; half of the disk's and a tenth of the time for the third shard."""
-    needs = {stage.name: Need(100_000_000, 60.0, 8_000_000) for stage in LINE}
-    return needs | {"sum.3": Need(100_000_000, 6.0, 4_000_000)}
+
+    @staticmethod
+    def of(_size: object, _config: LineConfig, _threads: int = 1, _machine_bytes: int = 0) -> "RunForecast":
+        return RunForecast()
+
+    def needs(self, _speed: float) -> dict[str, Need]:
+        needs = {stage.name: Need(100_000_000, 60.0, 8_000_000) for stage in LINE}
+        return needs | {"sum.3": Need(100_000_000, 6.0, 4_000_000)}
 
 
 def has_control(_source: object) -> bool:

@@ -13,9 +13,9 @@ from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, loa
 from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.quality.free_space import free_space
 from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks.block_windows import WindowScheme, block_windows, coarse_coverages, footage_on
 from splatpipe.pipeline.train.blocks.cells.partition import Cell, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
-from splatpipe.pipeline.train.blocks.forecast import WindowScheme, block_forecasts, coarse_coverages, footage_on
 from splatpipe.pipeline.train.blocks.scope import BlockScope, write_free_space
 from splatpipe.pipeline.train.blocks.training import BlockTask, SiteParts, train_block
 from splatpipe.pipeline.train.options import TrainConfig
@@ -42,12 +42,12 @@ def surveyed(site: SiteParts, config: TrainConfig = CONFIG, window: int = WINDOW
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     points, tracks = load_points_and_tracks(site.dataset)
     cameras, seen = [view.camera for view in views], coverages_of(site)
-    forecasts = block_forecasts(config, views, seen, points.xyz, site.partition, window)
+    blocks = block_windows(config, views, seen, points.xyz, site.partition, window)
     cut = WindowScheme.of(config, *footage_on(config, cameras, window))
     site.prospects.mkdir(exist_ok=True)
-    for number, forecast in enumerate(forecasts):
+    for number, block in enumerate(blocks):
         scene = (read_splat(site.coarse / "model.ply"), seen, points.xyz)
-        BlockScope.of(site.partition, number, forecast.windows, cut, scene).write(site.prospects, number)
+        BlockScope.of(site.partition, number, block.windows, cut, scene).write(site.prospects, number)
     write_free_space(site.prospects, free_space(cameras, points.xyz, [tracks[each.name] for each in cameras]))
     return site
 

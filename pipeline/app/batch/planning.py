@@ -7,7 +7,6 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -39,7 +38,7 @@ from splatpipe.pipeline.engine.runs.session import Request, status_of
 from splatpipe.pipeline.engine.runs.source import open_source
 from splatpipe.pipeline.engine.runs.store import Part, is_copy
 from splatpipe.pipeline.engine.stage import Shard, stage_name
-from splatpipe.stages.forecast import forecast, machine_speed
+from splatpipe.stages.forecast.needs import RunForecast, machine_speed
 from splatpipe.stages.line import LINE
 
 CLUSTER_THREADS = 8  # most threads of a job on another machine; a profile's set-threads overrides it
@@ -167,8 +166,11 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
         planned = _with_previous_failure(planned, first, request.out)
     if names and not planned.message:
         planned = _with_input_error(planned, request, settings)
-    memory = available_memory_bytes() if settings.local else 0
-    forecast_needs = partial(forecast, size, config, speed=machine_speed(), machine_bytes=memory)
+    memory, speed = available_memory_bytes() if settings.local else 0, machine_speed()
+
+    def forecast_needs(threads: int) -> Mapping[str, Need]:
+        return RunForecast.of(size, config, threads, memory).needs(speed)
+
     # If the stage that counts the shards has to run, it will determine their number.
     first_stages = [each for each in statuses if each.stage.name in names] if first else []
     shards = {} if planned.message else missing_shards(first_stages)

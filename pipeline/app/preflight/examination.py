@@ -99,7 +99,7 @@ def examine_capture(
     Raises:
         SplatpipeError: if there is no such folder, or a file that an option names.
     """
-    from splatpipe.stages.forecast import has_control
+    from splatpipe.stages.forecast.needs import has_control
     from splatpipe.stages.line import LINE
 
     began_s, when_s = time.monotonic(), time.time()
@@ -181,9 +181,8 @@ def forecast_presets(
     intake: Intake, control: bool, configs: Mapping[str, LineConfig], threads: int
 ) -> tuple[tuple[PresetForecast, ...], MachineFacts]:
     """Forecast what a run with each preset would need, and whether this machine has it."""
-    from splatpipe.stages.costs import REFERENCE
-    from splatpipe.stages.forecast import machine_speed, needs_of
-    from splatpipe.stages.work import CaptureSize, CaptureWork
+    from splatpipe.stages.forecast.needs import RunForecast, machine_speed
+    from splatpipe.stages.forecast.training import CaptureSize
 
     disk = shutil.disk_usage(Path.cwd())
     machine = MachineFacts(available_memory_bytes(), available_cores(), disk.free)
@@ -195,8 +194,8 @@ def forecast_presets(
     speed = machine_speed()
     forecasts = []
     for preset, config in configs.items():
-        work = CaptureWork.of(size, config, REFERENCE, threads, machine.memory_bytes)
-        need, blocks = whole(needs_of(work, speed)), work.blocks
+        run = RunForecast.of(size, config, threads, machine.memory_bytes)
+        need = whole(run.needs(speed))
         disk_bytes = need.disk_bytes + need.scratch_bytes
         lacking = []
         if 0 < machine.memory_bytes < need.memory_bytes:
@@ -214,7 +213,7 @@ def forecast_presets(
                 need.seconds(threads),
                 disk_bytes,
                 "; ".join(lacking),
-                1 if blocks is None else blocks.division.blocks,
+                run.training.blocks,
             )
         )
     return tuple(forecasts), machine

@@ -11,8 +11,8 @@ from statistics import median
 from splatpipe.pipeline.engine.runs.source import RunSource
 from splatpipe.pipeline.photos.files.companions import find_companions
 from splatpipe.pipeline.photos.files.names import is_photo
-from splatpipe.stages.forecast import has_control
-from splatpipe.stages.work import USUAL_SHAPE, CaptureSize
+from splatpipe.stages.forecast.needs import has_control
+from splatpipe.stages.forecast.training import USUAL_SHAPE, CaptureSize
 
 SAMPLED = 9  # photos whose size is read; within a capture most are alike
 

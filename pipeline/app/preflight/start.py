@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runs.session import Request
-    from splatpipe.stages.block_work import BlockWork
+    from splatpipe.pipeline.train.blocks.cells.division import Division
+    from splatpipe.stages.forecast.training import Training
     from splatpipe.stages.options import LineConfig
 
 
@@ -55,10 +56,10 @@ def require_memory(request: Request, until: str | None = None, *, here: bool = T
     """
     from splatpipe.pipeline.engine.errors import MachineError
     from splatpipe.pipeline.engine.machine import memory_limit_bytes
-    from splatpipe.stages.forecast import min_memory_bytes
+    from splatpipe.stages.forecast.training import min_memory_bytes
 
     config = cast("LineConfig", request.config)
-    limit, least = config.train.max_memory_bytes, min_memory_bytes(config)
+    limit, least = config.train.max_memory_bytes, min_memory_bytes(config.train)
     if 0 < limit < least and not _on_cuda(request.machine.device):
         raise MachineError(
             f"Training does not fit in {limit / 1e9:.2f} GB: the libraries alone take most of {least / 1e9:.2f} GB.",
@@ -93,18 +94,15 @@ def forecast_text(request: Request) -> str:
     from splatpipe.pipeline.engine.machine import available_memory_bytes
     from splatpipe.pipeline.engine.runs.needs import whole
     from splatpipe.pipeline.engine.runs.source import open_source
-    from splatpipe.stages.costs import REFERENCE
-    from splatpipe.stages.forecast import machine_speed, needs_of
-    from splatpipe.stages.work import CaptureWork
+    from splatpipe.stages.forecast.needs import RunForecast, machine_speed
 
     config, threads = cast("LineConfig", request.config), request.machine.threads
     source = open_source(request.photos, request.out, request.stages, config)
     size = size_of(source)
     if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request.machine.device):
         return ""
-    memory = available_memory_bytes()
-    work = CaptureWork.of(size, config, REFERENCE, threads, memory)
-    needs = needs_of(work, machine_speed())
+    run = RunForecast.of(size, config, threads, available_memory_bytes())
+    training, needs = run.training, run.needs(machine_speed())
     need = whole(needs)
     seconds = sum(each.seconds(threads) for each in needs.values())
     text = f"{size.photos:,} photos of {size.megapixels:.1f} megapixels take about {roughly(seconds)}, "
@@ -113,12 +111,13 @@ def forecast_text(request: Request) -> str:
     )
     if config.train.time_budget_s:
         return f"{text}."
-    training = sum(needs[stage].seconds(threads) for stage in ("blocks", "train"))
-    text += f": training {roughly(training)}, {work.iterations:,} iterations"
-    if work.blocks is not None:
-        text += f", {blocks_text(work.blocks)}"
-    elif config.train.max_memory_bytes and work.most_gaussians < work.grown:
-        text += f"; the memory holds {round(work.most_gaussians, -3):,.0f} Gaussians, and the photos would support more"
+    seconds = sum(needs[stage].seconds(threads) for stage in ("blocks", "train"))
+    text += f": training {roughly(seconds)}, {training.iterations:,} iterations"
+    most = training.most_gaussians
+    if training.division is not None:
+        text += f", {blocks_text(training, training.division)}"
+    elif config.train.max_memory_bytes and most < training.grown:
+        text += f"; the memory holds {round(most, -3):,.0f} Gaussians, and the photos would support more"
     return f"{text}."
 
 
@@ -132,15 +131,14 @@ def shortage_text(request: Request, until: str | None = None) -> str:
     from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.engine.machine import memory_limit_bytes
     from splatpipe.pipeline.engine.runs.source import open_source
-    from splatpipe.stages.costs import REFERENCE
-    from splatpipe.stages.work import TRAINING, CaptureWork
+    from splatpipe.stages.forecast.needs import TRAINING, RunForecast
 
     limit, config = memory_limit_bytes(request.machine.memory_bytes), cast("LineConfig", request.config)
     source = open_source(request.photos, request.out, request.stages, config)
     size = size_of(source)
     if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or not limit:
         return ""
-    needs = CaptureWork.of(size, config, REFERENCE, 1, limit).needs(1.0)
+    needs = RunForecast.of(size, config, 1, limit).needs(1.0)
     names = [stage.name for stage in request.stages]
     names = names[: names.index(until) + 1] if until in names else names
     short = [name for name in names if name not in TRAINING and name in needs and needs[name].memory_bytes > limit]
@@ -151,12 +149,12 @@ def shortage_text(request: Request, until: str | None = None) -> str:
     return f"{text}; raise it (--max-memory, the container's limit), or give fewer or smaller photos."
 
 
-def blocks_text(blocks: BlockWork) -> str:
+def blocks_text(training: Training, division: Division) -> str:
     """How the scene is divided into blocks, and what a block needs, in words."""
-    division = blocks.division
     text = f"in {division.blocks} blocks of {division.need.trained:,} Gaussians and "
     text += f"{division.memory_bytes / 1e9:.1f} GB of memory at most"
-    return f"{text}, about {round(blocks.load.trained, -3):,.0f} Gaussians and {blocks.photos:.0f} photos each"
+    trained = round(training.block_gaussians(division), -3)
+    return f"{text}, about {trained:,.0f} Gaussians and {training.photos_per_block:.0f} photos each"
 
 
 def _on_cuda(device: str) -> bool:

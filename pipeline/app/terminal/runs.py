@@ -75,7 +75,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     from splatpipe.pipeline.engine.runs.session import Request
     from splatpipe.pipeline.engine.runs.source import with_absolute_files
     from splatpipe.pipeline.engine.stage import Machine
-    from splatpipe.stages.forecast import Forecaster
+    from splatpipe.stages.forecast.needs import Forecaster
     from splatpipe.stages.line import LINE
 
     began_s = round(time.monotonic() - spent_s(), 3)

@@ -14,7 +14,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.appearance.sky_file import write_skies
-from splatpipe.pipeline.train.blocks.forecast import footage_on
+from splatpipe.pipeline.train.blocks.block_windows import footage_on
 from splatpipe.pipeline.train.blocks.lengths import coarse_lengths
 from splatpipe.pipeline.train.blocks.schedules import coarse_schedule
 from splatpipe.pipeline.train.loop import train_whole

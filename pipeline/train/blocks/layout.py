@@ -18,18 +18,18 @@ from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.quality.free_space import free_space
 from splatpipe.pipeline.splat.sky.sky_mask import WORK_MEGAPIXELS, SkyPhoto, up_of
+from splatpipe.pipeline.train.blocks.block_windows import (
+    BlockWindows,
+    WindowScheme,
+    block_windows,
+    coarse_coverages,
+    footage_on,
+)
 from splatpipe.pipeline.train.blocks.cells.cutting import cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.cells.division import Division
 from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
 from splatpipe.pipeline.train.blocks.cells.site_plan import SitePlan, block_limits
-from splatpipe.pipeline.train.blocks.forecast import (
-    BlockForecast,
-    WindowScheme,
-    block_forecasts,
-    coarse_coverages,
-    footage_on,
-)
 from splatpipe.pipeline.train.blocks.scope import BlockScope, write_free_space
 from splatpipe.pipeline.train.options import TrainConfig
 
@@ -67,25 +67,25 @@ def lay_out(
         means = gaussians.means.double().numpy()
         weights = shares(work, partition).mean(axis=0).tolist()
         block_counts = [(weight, *_count_gaussians(partition, k, means)) for k, weight in enumerate(weights)]
-        forecasts = block_forecasts(train, views, seen, xyz, partition, division.window_pixels)
+        blocks = block_windows(train, views, seen, xyz, partition, division.window_pixels)
         limits = block_limits(division, train.sh_degree, block_counts)
         cameras = [view.camera for view in views]
         parts = WindowScheme.of(train, *footage_on(train, cameras, division.window_pixels))
         scene = (gaussians, seen, xyz)
-        around = _look_around(partition, parts, forecasts, scene, out / PROSPECTS, report)
+        around = _look_around(partition, parts, blocks, scene, out / PROSPECTS, report)
         if train.prune_free_space:
             write_free_space(out / PROSPECTS, free_space(cameras, xyz, observed))
     summary: Mapping[str, JSON] = {
         "limit_bytes": division.limit_bytes,
         "margin": partition.margin,
-        "photos": [forecast.photos for forecast in forecasts],
-        "iterations": [forecast.iterations for forecast in forecasts],
+        "photos": [block.photos for block in blocks],
+        "iterations": [block.iterations for block in blocks],
         "gaussians": [limit.share for limit in limits],
         "trained": [limit.trained for limit in limits],
         "start": [min(limit.trained, inside) for limit, (_, _, inside) in zip(limits, block_counts, strict=True)],
-        "steps": [forecast.steps for forecast in forecasts],
+        "steps": [block.steps for block in blocks],
         "frozen": [min(limit.frozen, count) for limit, count in zip(limits, around, strict=True)],
-        "disk_bytes": [forecast.disk_bytes for forecast in forecasts],
+        "disk_bytes": [block.disk_bytes for block in blocks],
     }
     return SitePlan(partition, tuple(limits), division.window_pixels, division.limit_bytes), {"of_blocks": summary}
 
@@ -93,7 +93,7 @@ def lay_out(
 def _look_around(
     partition: Partition,
     parts: WindowScheme,
-    forecasts: Sequence[BlockForecast],
+    blocks: Sequence[BlockWindows],
     scene: tuple[Gaussians, Sequence[PhotoCoverage], Float64[np.ndarray, "p 3"]],
     folder: Path,
     report: Reporter,
@@ -103,15 +103,15 @@ def _look_around(
     Args:
         partition: The cells.
         parts: How photos are cut into windows.
-        forecasts: The blocks' forecasts.
+        blocks: What each block trains on.
         scene: The coarse model, all photos' coverages and all sparse points.
         folder: Output folder.
         report: Receives progress.
     """
     found = []
-    for number, forecast in enumerate(forecasts):
-        report.progress(number, len(forecasts), "choosing the photos of blocks", "blocks")
-        scope = BlockScope.of(partition, number, forecast.windows, parts, scene)
+    for number, block in enumerate(blocks):
+        report.progress(number, len(blocks), "choosing the photos of blocks", "blocks")
+        scope = BlockScope.of(partition, number, block.windows, parts, scene)
         scope.write(folder, number)
         found.append(len(scope.around.rows))
     return found

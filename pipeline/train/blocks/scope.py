@@ -24,12 +24,12 @@ from splatpipe.pipeline.splat.containers.archives import read_archive
 from splatpipe.pipeline.splat.containers.ply import read_splat, write_splat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.quality.free_space import FreeSpace, PhotoBounds
+from splatpipe.pipeline.train.blocks.block_windows import Parts, WindowScheme
 from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
 from splatpipe.pipeline.train.blocks.cells.sample_mask import SampleMask, counted_samples
 from splatpipe.pipeline.train.blocks.cells.surroundings import BlockSurroundings, visible_around
 from splatpipe.pipeline.train.blocks.cells.visibility import BlockPhoto, BlockViews
-from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
 
 FROZEN = "frozen.ply"
 FREE = "free_space.npz"

@@ -22,10 +22,10 @@ from splatpipe.pipeline.splat.sky.panorama import read_panorama
 from splatpipe.pipeline.train.appearance.exposure import Exposure, read_exposures
 from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.appearance.sky_file import read_skies
+from splatpipe.pipeline.train.blocks.block_windows import Parts, WindowScheme
 from splatpipe.pipeline.train.blocks.cells.fence import Fence
 from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.coarse import SKIES
-from splatpipe.pipeline.train.blocks.forecast import Parts, WindowScheme
 from splatpipe.pipeline.train.blocks.schedules import block_schedule
 from splatpipe.pipeline.train.blocks.scope import BlockScope, ScopeReader, read_free_space, rows_of
 from splatpipe.pipeline.train.hooks import Technique

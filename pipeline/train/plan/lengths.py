@@ -168,6 +168,33 @@ def lengths_of(config: TrainConfig, footage: PhotoSizes) -> list[Length]:
     return divided(footage, least, round(least * longer**config.length_growth))
 
 
+@dataclass(frozen=True)
+class IterationScale:
+    """How fast a model is trained.
+
+    A site with more photos takes more iterations, but each Gaussian is seen no more often: phases keep their length,
+    except that every photo must have its turn in each.
+
+    Attributes:
+        iterations: Number of iterations that the learning rates are for.
+        photos: Number of photos that each phase must at least visit.
+    """
+
+    iterations: int
+    photos: int
+
+    @staticmethod
+    def of(config: TrainConfig, footage: PhotoSizes) -> IterationScale:
+        """The pace of a training; one with a given length keeps the published phase lengths, whatever the photos."""
+        if config.iterations == "auto":
+            return IterationScale(config.least_iterations, footage.photos)
+        return IterationScale(config.iterations, 1)
+
+    def scaled_length(self, published: int, shares: int) -> int:
+        """Length of a phase, iterations: as published, or 1/``shares`` of a short run; at least one visit per photo."""
+        return max(1, min(published, self.iterations // shares), self.photos)
+
+
 def growth_until(each: Sequence[Length]) -> int:
     """The last iteration of density control: every size adds the Gaussians that its detail needs."""
     *before, (_finest, count) = each

@@ -10,6 +10,7 @@ from splatpipe.pipeline.train.densify import PRUNE_SCREEN_PX, DensitySchedule
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.lengths import (
     UNTIL,
+    IterationScale,
     Length,
     PhotoSizes,
     Stretch,
@@ -228,33 +229,6 @@ def schedule_of(config: TrainConfig, footage: PhotoSizes, each: list[Length]) ->
         rates=PUBLISHED if config.density == "published" else rates_of(scale.iterations),
         density=_density(config, each, scale),
     )
-
-
-@dataclass(frozen=True)
-class IterationScale:
-    """How fast a model is trained.
-
-    A site with more photos takes more iterations, but each Gaussian is seen no more often: phases keep their length,
-    except that every photo must have its turn in each.
-
-    Attributes:
-        iterations: Number of iterations that the learning rates are for.
-        photos: Number of photos that each phase must at least visit.
-    """
-
-    iterations: int
-    photos: int
-
-    @staticmethod
-    def of(config: TrainConfig, footage: PhotoSizes) -> IterationScale:
-        """The pace of a training; one with a given length keeps the published phase lengths, whatever the photos."""
-        if config.iterations == "auto":
-            return IterationScale(config.least_iterations, footage.photos)
-        return IterationScale(config.iterations, 1)
-
-    def scaled_length(self, published: int, shares: int) -> int:
-        """Length of a phase, iterations: as published, or 1/``shares`` of a short run; at least one visit per photo."""
-        return max(1, min(published, self.iterations // shares), self.photos)
 
 
 def _density(config: TrainConfig, each: list[Length], scale: IterationScale) -> DensitySchedule:

@@ -4,7 +4,7 @@ import sys
 
 import sharded
 
-for name in ("line", "options", "forecast"):
+for name in ("line", "options", "forecast.needs"):
     sys.modules[f"splatpipe.stages.{name}"] = sharded
 
 from splatpipe.pipeline.app.preflight import start  # noqa: E402

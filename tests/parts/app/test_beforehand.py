@@ -14,10 +14,10 @@ from splatpipe.pipeline.engine import machine
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.runs.session import Request
-from splatpipe.stages.costs import REFERENCE
-from splatpipe.stages.forecast import forecast, min_memory_bytes
+from splatpipe.pipeline.train.options import TrainConfig
+from splatpipe.stages.forecast.needs import RunForecast
+from splatpipe.stages.forecast.training import CaptureSize, min_memory_bytes
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import CaptureSize, CaptureWork
 
 
 def request(tmp_path: Path, preset: str, **train: object) -> Request:
@@ -40,7 +40,7 @@ def test_a_time_budget_may_use_photos_at_full_size_unless_a_smaller_one_is_set(s
 
 
 def test_the_smallest_limit_that_the_message_names_is_accepted(tmp_path: Path) -> None:
-    least = min_memory_bytes(LineConfig())
+    least = min_memory_bytes(TrainConfig())
     require_memory(request(tmp_path, "standard"))
     require_memory(request(tmp_path, "standard", max_memory_bytes=least))
     with pytest.raises(MachineError) as raised:
@@ -51,7 +51,7 @@ def test_the_smallest_limit_that_the_message_names_is_accepted(tmp_path: Path) -
 def test_a_container_that_is_too_small_to_train_is_refused_at_once_unless_it_need_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    least = min_memory_bytes(LineConfig()) + COMMAND_BYTES
+    least = min_memory_bytes(TrainConfig()) + COMMAND_BYTES
     asked = request(tmp_path, "standard")
     monkeypatch.setattr(machine, "memory_limit_bytes", lambda limit=0: least)
     require_memory(asked)
@@ -67,7 +67,7 @@ def test_a_run_states_its_cost_and_what_the_memory_limit_leaves_out(tmp_path: Pa
     text = forecast_text(request(tmp_path, "preview"))
     assert text.startswith("40 photos of 1.1 megapixels take about ") and "1,500 iterations" in text
     assert "GB of memory" in text and "GB of disk" in text and "memory holds" not in text
-    least = min_memory_bytes(LineConfig())
+    least = min_memory_bytes(TrainConfig())
     tight = request(tmp_path, "standard", max_memory_bytes=least)
     assert "the memory holds" in forecast_text(tight) and "the photos would support more" in forecast_text(tight)
     assert forecast_text(request(tmp_path, "preview", time_budget_s=600.0)).endswith("GB of disk.")
@@ -88,13 +88,14 @@ def test_a_run_says_which_stages_may_exceed_its_memory(tmp_path: Path, monkeypat
 def test_forecasts_follow_lengths_windows_and_limits(preset: str) -> None:
     config = resolve(LineConfig, [load_preset(preset)])
     small, large = (CaptureSize(photos, 20.0, True) for photos in (50, 1000))
-    each = [CaptureWork.of(size, config, REFERENCE, 2) for size in (small, large)]
+    few, many = (RunForecast.of(size, config, 2) for size in (small, large))
     visits = (20.0, 5.4) if preset == "preview" else (20.0, 20.0)  # a preview's fall: train.length_growth
-    assert all(work.iterations >= least * work.size.photos for work, least in zip(each, visits, strict=True))
-    assert all(work.window <= 0.53 for work in each)
-    few, many = (forecast(size, config)["train"] for size in (small, large))
+    for run, least in zip((few, many), visits, strict=True):
+        assert run.training.iterations >= least * run.size.photos and run.training.window <= 530_000
+    fewer, more = (run.needs(1.0)["train"] for run in (few, many))
     decoded = 3 * 0.25e6 * (1000 - 50)  # bytes of the additional photos, at less than any preset's size
-    assert many.cpu_seconds > few.cpu_seconds and many.scratch_bytes > few.scratch_bytes + decoded
-    limited = resolve(LineConfig, [load_preset(preset), {"train": {"max_memory_bytes": 800_000_000}}])
-    assert CaptureWork.of(small, limited, REFERENCE, 2).window < each[0].window
-    assert forecast(small, limited)["train"].memory_bytes <= 800_000_000
+    assert more.cpu_seconds > fewer.cpu_seconds and more.scratch_bytes > fewer.scratch_bytes + decoded
+    limit = {"train": {"max_memory_bytes": 800_000_000}}
+    limited = RunForecast.of(small, resolve(LineConfig, [load_preset(preset), limit]), 2)
+    assert limited.training.window < few.training.window
+    assert limited.needs(1.0)["train"].memory_bytes <= 800_000_000

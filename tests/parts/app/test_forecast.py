@@ -9,13 +9,11 @@ from pathlib import Path
 
 from command import answered
 
-from splatpipe.stages.forecast import (
-    machine_speed,
-)
+from splatpipe.stages.forecast.needs import machine_speed
 
 
 def test_it_is_cheap_and_runs_anywhere() -> None:
-    code = "import sys, splatpipe.stages.forecast; print({'numpy', 'torch', 'cv2'} & set(sys.modules))"
+    code = "import sys, splatpipe.stages.forecast.needs; print({'numpy', 'torch', 'cv2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
     assert 0.25 <= machine_speed() <= 4.0

@@ -27,11 +27,11 @@ from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 from splatpipe.pipeline.splat.quality.free_space import free_space
 from splatpipe.pipeline.splat.sky.backdrop import backdrop_limit
 from splatpipe.pipeline.train import loop
+from splatpipe.pipeline.train.blocks.block_windows import block_windows
 from splatpipe.pipeline.train.blocks.cells.needs import block_need
 from splatpipe.pipeline.train.blocks.cells.partition import Cell, Partition
 from splatpipe.pipeline.train.blocks.cells.sample_mask import MARGINS, counted_samples
 from splatpipe.pipeline.train.blocks.coarse import TrainingLimits, train_coarse
-from splatpipe.pipeline.train.blocks.forecast import block_forecasts
 from splatpipe.pipeline.train.blocks.schedules import block_schedule, share_at
 from splatpipe.pipeline.train.blocks.scope import BlockScope, read_free_space, rows_of
 from splatpipe.pipeline.train.blocks.training import Block, SiteParts, train_block
@@ -270,17 +270,16 @@ def test_photos_come_with_their_counting_pixels_and_share_of_the_whole(
     assert 0.2 * len(photos) < len(cut) < len(photos)
 
 
-def test_outlook_matches_a_blocks_training(site: SiteParts, undisturbed: Path) -> None:
+def test_a_blocks_windows_are_those_of_its_training(site: SiteParts, undisturbed: Path) -> None:
     kept = set(load_split(site.split).train)
     views = [view for view in load_views(site.dataset) if view.camera.name in kept]
     points, _ = load_points_and_tracks(site.dataset)
-    forecast, _ = block_forecasts(CONFIG, views, coverages_of(site), points.xyz, PARTITION, WINDOW)
+    block, _ = block_windows(CONFIG, views, coverages_of(site), points.xyz, PARTITION, WINDOW)
     plan = TrainingPlan.from_json((undisturbed / "plan.json").read_text())
-    assert (forecast.photos, forecast.iterations) == (len(plan.train_views), plan.schedule.iterations)
-    assert forecast.parts == (len(BlockScope.read(site.prospects, 0).windows[0]),)
+    assert (block.photos, block.iterations) == (len(plan.train_views), plan.schedule.iterations)
+    assert np.array_equal(block.windows[0], BlockScope.read(site.prospects, 0).windows[0])
     density = plan.schedule.density
-    assert forecast.steps == sum(map(density.is_step, range(1, plan.schedule.iterations + 1))) > 0
-    assert forecast.pixels[0] <= WINDOW * forecast.parts[0]
+    assert block.steps == sum(map(density.is_step, range(1, plan.schedule.iterations + 1))) > 0
 
 
 def test_positions_move_as_fast_as_in_the_whole_with_as_many_gaussians() -> None:

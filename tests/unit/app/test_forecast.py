@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -12,29 +13,24 @@ from forecast_fit import compared, fit, left_out, scene_of
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.runs.needs import Need, whole
-from splatpipe.pipeline.train.blocks.cells.division import Division, SceneSize
+from splatpipe.pipeline.train.blocks.cells.division import SceneSize, divided
 from splatpipe.pipeline.train.plan.limits import bytes_per_gaussian
 from splatpipe.pipeline.web.options import FORMATS
-from splatpipe.stages import work as work_module
-from splatpipe.stages.block_work import START_S
-from splatpipe.stages.costs import FORMAT_COSTS, REFERENCE, WITH_PHOTOS
-from splatpipe.stages.forecast import (
-    CaptureSize,
-    Forecaster,
-    forecast,
-    needs_of_blocks,
-    seconds,
-    work_as_decided,
-)
+from splatpipe.stages.forecast.costs import FORMAT_COSTS, REFERENCE, SCRATCH, WITH_PHOTOS
+from splatpipe.stages.forecast.needs import Forecaster, RunForecast
+from splatpipe.stages.forecast.training import CaptureSize
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
-from splatpipe.stages.work import CaptureWork
 
 SIZE = CaptureSize(photos=80, megapixels=12.0, positions=True)
 
 
 def configured(preset: str, **train: Any) -> LineConfig:
     return resolve(LineConfig, [load_preset(preset), {"train": train}])
+
+
+def forecast(size: CaptureSize, config: LineConfig, threads: int = 2, speed: float = 1.0) -> dict[str, Need]:
+    return RunForecast.of(size, config, threads).needs(speed)
 
 
 def test_every_stage_has_a_forecast_that_grows_with_the_preset() -> None:
@@ -87,7 +83,7 @@ def test_threads_divide_parallel_work_and_cost_memory() -> None:
     assert one["train"].cpu_seconds == four["train"].cpu_seconds
     assert one["features"].memory_bytes < four["features"].memory_bytes
     need = Need(1, 100.0, 1, parallel=0.8)
-    assert seconds(need, 1) == pytest.approx(100.0) and seconds(need, 4) == pytest.approx(40.0)
+    assert need.seconds(1) == pytest.approx(100.0) and need.seconds(4) == pytest.approx(40.0)
     fast = forecast(SIZE, configured("standard"), speed=2.0)
     assert fast["train"].cpu_seconds == pytest.approx(one["train"].cpu_seconds / 2)
 
@@ -104,7 +100,7 @@ def test_limits_of_memory_and_of_gaussians_bound_the_training() -> None:
 @pytest.mark.parametrize("budget", [120.0, 1800.0, 36_000.0])
 def test_a_time_budget_is_the_forecast_time(budget: float) -> None:
     needs = forecast(CaptureSize(20, 2.0, True), configured("preview", time_budget_s=budget), threads=4)
-    assert sum(seconds(need, 4) for need in needs.values()) == pytest.approx(budget, rel=0.15)
+    assert sum(need.seconds(4) for need in needs.values()) == pytest.approx(budget, rel=0.15)
 
 
 def test_a_run_forecasts_from_ingests_counts() -> None:
@@ -113,19 +109,17 @@ def test_a_run_forecasts_from_ingests_counts() -> None:
     assert forecaster({"ingest": {"photos": 0, "positions": 0, "camera_groups": []}}) == {}
     groups = [{"photos": 3, "size": [640, 480]}, {"photos": 77, "size": [3000, 4000]}]
     needs = forecaster({"ingest": {"photos": 80, "positions": 80, "camera_groups": groups}})
-    assert needs == forecast(replace(SIZE, shape=0.75), configured("preview"), 2, speed=forecaster.speed)
+    assert needs == forecast(replace(SIZE, shape=0.75), configured("preview"), 2, forecaster.speed)
 
 
 LARGE = CaptureSize(photos=1000, megapixels=1.1, positions=True)
-
-
 LIMITED = {"max_gaussians": 4_000_000, "max_memory_bytes": 1_500_000_000}
 
 
 def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> None:
-    work = CaptureWork.of(LARGE, configured("standard", **LIMITED), REFERENCE, 1)
-    assert work.blocks is not None
-    most, limit = work.blocks.division.need.trained, LIMITED["max_memory_bytes"]
+    run = RunForecast.of(LARGE, configured("standard", **LIMITED), 1)
+    assert run.training.division is not None
+    most, limit = run.training.division.need.trained, LIMITED["max_memory_bytes"]
     output = {
         "iterations": [1000, 1000, 1000, 2000],
         "start": [10_000, 20_000, 10 * most, 10_000],
@@ -134,43 +128,35 @@ def test_blocks_are_forecast_from_their_initial_gaussians_and_surroundings() -> 
         "frozen": [50_000, 50_000, most, 90_000],
         "disk_bytes": [10**8, 10**8, 10**8, 3 * 10**8],
     }
-    needs = needs_of_blocks(work, output, 1.0)
+    needs = run.needs_of_blocks(output, 1.0)
     few, more, full, longer = (needs[f"train.{number}"] for number in (1, 2, 3, 4))
     assert few.memory_bytes < more.memory_bytes < full.memory_bytes <= limit
     assert more.memory_bytes - few.memory_bytes == pytest.approx(10_000 * 1.25**4 * bytes_per_gaussian(3), rel=0.01)
-    assert full.memory_bytes > 0.8 * work.blocks.division.memory_bytes - 240_000_000  # the bound counts more libraries
-    assert 1.9 * few.cpu_seconds < longer.cpu_seconds + START_S and longer.scratch_bytes > few.scratch_bytes + 10**8
+    assert full.memory_bytes == run.training.division.memory_bytes == run.needs(1.0)["train"].memory_bytes
+    assert 1.9 * few.cpu_seconds < longer.cpu_seconds and longer.scratch_bytes > few.scratch_bytes + 10**8
     assert few.disk_bytes < more.disk_bytes and needs["train"].memory_bytes == full.memory_bytes
     assert needs["train"].cpu_seconds == pytest.approx(sum(need.cpu_seconds for need in (few, more, full, longer)))
-    assert needs_of_blocks(work, {}, 1.0) == {}
+    assert run.needs_of_blocks({}, 1.0) == {}
 
 
-def test_a_run_follows_the_decision_of_blocks_which_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-    divide = work_module.divided
-
-    def counting(*arguments: Any) -> Division:
-        asked.append(1)
-        return divide(*arguments)
-
-    monkeypatch.setattr(work_module, "divided", counting)
-    forecaster = Forecaster(configured("standard", **LIMITED), 2)
-    groups = [{"photos": 1000, "size": [1200, 900]}]
-    before = {"ingest": {"photos": 1000, "positions": 1000, "camera_groups": groups}}
-    needs = [forecaster(before) for _ in range(3)]
-    assert len(asked) == 1 and needs[0] == needs[1] == needs[2]
-    division = divide(SceneSize(4_000_000, 1e7, 500_000, 3, 1000), 1_500_000_000, 40)
-    decided = {"blocks": 40, "division": json.loads(json.dumps(asdict(division)))}
-    work = work_as_decided(LARGE, forecaster.config, 2, decided)
-    assert len(asked) == 1 and work.blocks is not None and work.blocks.division == division
-    assert work_as_decided(LARGE, forecaster.config, 2, {"blocks": 1}).blocks is None
+def test_a_run_follows_the_decision_of_blocks_wherever_it_was_made() -> None:
     free = configured("standard", max_gaussians=4_000_000)
-    kept = work_as_decided(LARGE, free, 2, {"blocks": 1, "limit_bytes": 1_500_000_000})
-    assert (
-        kept.needs(1.0)["train"].memory_bytes
-        <= 1_500_000_000
-        < CaptureWork.of_whole(LARGE, free, REFERENCE, 2).needs(1.0)["train"].memory_bytes
+    division = divided(SceneSize(4_000_000, 1e7, 500_000, 3, 1000), 1_500_000_000, 40)
+    decided = {"blocks": 40, "division": json.loads(json.dumps(asdict(division)))}
+    unlimited, in_blocks, near = (
+        RunForecast.of(LARGE, free, 2, decided=summary)
+        for summary in ({"blocks": 1}, decided, {"blocks": 1, "limit_bytes": 1_500_000_000})
     )
+    assert in_blocks.training.division == division and unlimited.training.division is None
+    memory = [run.needs(1.0)["train"].memory_bytes for run in (in_blocks, near, unlimited)]
+    assert max(memory[:2]) <= 1_500_000_000 < memory[2]
+
+
+def test_costs_name_only_sizes_that_every_run_has() -> None:
+    sizes = RunForecast.of(SIZE, configured("preview"), 2).sizes
+    assert SCRATCH.keys() <= REFERENCE.stages.keys()
+    for cost in REFERENCE.stages.values():
+        assert cost.powers.keys() | cost.memory.keys() | cost.disk.keys() <= sizes.keys()
 
 
 def test_the_costs_fit_the_runs_and_hold_for_captures_left_out() -> None:
@@ -180,13 +166,12 @@ def test_the_costs_fit_the_runs_and_hold_for_captures_left_out() -> None:
     fitted = fit(runs)
     assert benchmark.costs_text(fitted) == benchmark.costs_text(REFERENCE)
     outcomes = left_out(runs)
-    held = [benchmark.holds(outcome) for outcome in outcomes if set(outcome.run.used) != {"sparse"}]
+    held = [benchmark.holds(ratios) for ratios in outcomes if not math.isnan(ratios["memory"])]
     for each in zip(*held, strict=True):  # memory, CPU time
         assert sum(each) >= 5 / 6 * len(held) >= 5
-    mapped = [outcome.stages["sparse"] for outcome in outcomes]
-    assert sum(0.5 <= ratio <= 2.0 for ratio in mapped) >= 0.7 * len(mapped)  # texture and a ladder are not known
-    assert all(compared(run, fitted).bounds["sparse"] >= 0.99 for run in runs)
+    assert sum(0.5 <= ratios["sparse"] <= 2.0 for ratios in outcomes) >= 0.9 * len(runs)  # texture is not known
+    assert all(compared(run, fitted)["bound"] >= 0.99 for run in runs)
     # A fit is exact for the one run that it is of, where that run's scene is known.
     run = runs[0]
     alone = compared(run, scene_of(run, fit([run])))
-    assert (alone.memory, alone.cpu, alone.disk) == pytest.approx((1.0, 1.0, 1.0), rel=0.02)
+    assert (alone["memory"], alone["cpu"], alone["disk"]) == pytest.approx((1.0, 1.0, 1.0), rel=0.02)

@@ -1,4 +1,4 @@
-"""Forecast of each block, without training: its windows of photos at each size, and the effort that they take."""
+"""The windows of photos that each block trains on, and what follows from them: iterations, steps and disk space."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, photo_coverages
 from splatpipe.pipeline.train.blocks.cells.visibility import Windows, block_views
 from splatpipe.pipeline.train.blocks.lengths import finer_lengths
-from splatpipe.pipeline.train.blocks.schedules import block_lengths, block_schedule
+from splatpipe.pipeline.train.blocks.schedules import block_schedule
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.photo_cache import stored_bytes
 from splatpipe.pipeline.train.plan.lengths import PhotoSizes
@@ -79,14 +79,12 @@ Parts = dict[int, Int64[np.ndarray, "k 2"]]
 
 
 @dataclass(frozen=True, eq=False)
-class BlockForecast:
-    """The forecast of a block's training.
+class BlockWindows:
+    """What a block trains on.
 
     Attributes:
         windows: The windows that it trains on; rows are those of the photos.
         photos: Number of its photos.
-        parts: Number of windows at each of its sizes, first size first.
-        pixels: Total pixels of these windows, at that size.
         iterations: Number of iterations in its plan.
         steps: Number of density-control steps among them.
         disk_bytes: Maximum disk space of decoded photos during training.
@@ -94,8 +92,6 @@ class BlockForecast:
 
     windows: Parts
     photos: int
-    parts: tuple[int, ...]
-    pixels: tuple[int, ...]
     iterations: int
     steps: int
     disk_bytes: int
@@ -137,15 +133,15 @@ def parts_of(visible: Iterable[Mapping[int, Bool[np.ndarray, "cells w"]]], block
     return {level: np.array(pairs, np.int64).reshape(-1, 2) for level, pairs in found.items()}
 
 
-def block_forecasts(
+def block_windows(
     config: TrainConfig,
     views: Sequence[View],
     seen: Sequence[PhotoCoverage],
     xyz: Float64[np.ndarray, "p 3"],
     partition: Partition,
     window_pixels: int,
-) -> list[BlockForecast]:
-    """The forecast of each block.
+) -> list[BlockWindows]:
+    """What each block trains on.
 
     Args:
         config: The training options.
@@ -158,7 +154,7 @@ def block_forecasts(
     footage, most = footage_on(config, [view.camera for view in views], window_pixels)
     cut = WindowScheme.of(config, footage, most)
     visible = [visible_windows(partition, coverage, xyz, cut) for coverage in seen]
-    return [_forecast(config, footage, cut, views, parts_of(visible, block)) for block in range(len(partition.cells))]
+    return [_of_block(config, footage, cut, views, parts_of(visible, block)) for block in range(len(partition.cells))]
 
 
 def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: int) -> tuple[PhotoSizes, float | None]:
@@ -170,34 +166,24 @@ def footage_on(config: TrainConfig, cameras: Sequence[Camera], window_pixels: in
     return footage_of(sizes, most, window_pixels), most
 
 
-def _forecast(
-    config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: Sequence[View], parts: Parts
-) -> BlockForecast:
-    each = block_lengths(config, footage, {level: len(pairs) for level, pairs in parts.items()})
-    pixels, stored = [], 0
-    for level, _count in each:
-        pairs = parts[level]
-        pixels.append(sum(cut.frames(views[row].camera, level)[window].pixels for row, window in pairs.tolist()))
-    rows = sorted({row for pairs in parts.values() for row in pairs[:, 0].tolist()})
-    for level, pairs in parts.items():
-        for row in np.unique(pairs[:, 0]).tolist():
-            stored += stored_bytes(cut.camera(views[row].camera, level), views[row].mask_path is not None)
-    counts = tuple(len(parts[level]) for level, _count in each)
-    iterations = sum(count for _level, count in each)
-    return BlockForecast(
-        parts, len(rows), counts, tuple(pixels), iterations, _steps(config, footage, cut, views, parts), stored
-    )
-
-
-def _steps(config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: Sequence[View], parts: Parts) -> int:
-    """Number of density-control steps of a block."""
-    pieces = {level: len(pairs) for level, pairs in parts.items()}
-    rows = {row for pairs in parts.values() for row in pairs[:, 0].tolist()}
+def _of_block(
+    config: TrainConfig, footage: PhotoSizes, cut: WindowScheme, views: Sequence[View], windows: Parts
+) -> BlockWindows:
+    used = {level: [views[row] for row in np.unique(pairs[:, 0]).tolist()] for level, pairs in windows.items()}
+    rows = {row for pairs in windows.values() for row in pairs[:, 0].tolist()}
     if not rows:
-        return 0
+        return BlockWindows(windows, 0, 0, 0, 0)
     seen = footage_of(sizes_of([views[row].camera for row in rows]), cut.max_megapixels, cut.window_pixels)
-    density = block_schedule(config, footage, seen, pieces, 1.0).density
-    return sum(density.is_step(iteration) for iteration in range(density.first, density.last + 1))
+    counts = {level: len(pairs) for level, pairs in windows.items()}
+    schedule = block_schedule(config, footage, seen, counts, 1.0)
+    density = schedule.density
+    steps = sum(density.is_step(iteration) for iteration in range(density.first, density.last + 1))
+    stored = sum(
+        stored_bytes(cut.camera(view.camera, level), view.mask_path is not None)
+        for level, views_there in used.items()
+        for view in views_there
+    )
+    return BlockWindows(windows, len(rows), schedule.iterations, steps, stored)
 
 
 def coarse_coverages(
