@@ -276,7 +276,8 @@ def test_a_budgets_trial_also_uses_smaller_chunks_if_memory_is_short(
 
     def tried(plan: TrainingPlan, given: PlanningInput, report: tiny_scene.Recorder) -> TrainingPlan:
         subject = TimedScene(begun, given.trained_on, given.device)
-        measure(make_small_plan(ALL), subject, MeasuringBudget(0.0, 1e-3), report)
+        pilot = make_small_plan(ALL.model_copy(update={"max_gaussians": len(begun)}))
+        measure(pilot, subject, MeasuringBudget(0.0, 1e-3), report)
         return plan
 
     monkeypatch.setattr(loop, "plan_within_budgets", tried)
