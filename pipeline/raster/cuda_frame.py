@@ -69,8 +69,8 @@ class CudaFrame:
             outputs: As above.
             may_shrink: Whether to make chunks smaller if memory is short; a training does that itself, with a warning.
 
-            Raises:
-                torch.OutOfMemoryError: if memory is short and smaller chunks did not help or are not allowed.
+        Raises:
+            torch.OutOfMemoryError: if memory is short and smaller chunks did not help or are not allowed.
         """
         tiles = -(-view.width // TILE_PX) * -(-view.height // TILE_PX)
         size = FrameSize(len(parameters[0]), tiles)
