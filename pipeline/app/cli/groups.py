@@ -16,7 +16,7 @@ def with_groups(function: Callable[..., None]) -> Callable[..., None]:
         function: The command. A group is a dataclass whose fields are annotated options with defaults.
     """
     hints = get_type_hints(function, include_extras=True)
-    groups = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(function).parameters.values():
         if parameter.name not in groups:
