@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .cameras import LENSES, BrownLens, Pose, flight
-from .geodesy import Origin
-from .mesh import Array
-from .metadata import GpsPosition, build_exif, build_xmp, position_attributes, with_metadata
-from .render import Renderer
-from .scene import PLOT_YAW_DEG, DemoScene, build_scene, surface_of
-from .sensor import GAIN, WHITE_BALANCE, coded
-from .survey import gcp_list, sightings
+from splatpipe.demo.photography.cameras import LENSES, BrownLens, Pose, flight
+from splatpipe.demo.photography.geodesy import Origin
+from splatpipe.demo.photography.metadata import GpsPosition, build_exif, build_xmp, position_attributes, with_metadata
+from splatpipe.demo.photography.render import Renderer
+from splatpipe.demo.photography.sensor import GAIN, WHITE_BALANCE, coded
+from splatpipe.demo.photography.survey import gcp_list, sightings
+from splatpipe.demo.site.mesh import Array
+from splatpipe.demo.site.scene import PLOT_YAW_DEG, DemoScene, build_scene, surface_of
 
 SEED = 2026
 EXPOSURE_SIGMA_EV = 0.1

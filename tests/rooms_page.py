@@ -55,7 +55,7 @@ def inner_rooms_part() -> str:
         rooms = [member for member in members if _is_package(member)]
         if container in (ROOMS, STAGES) or not rooms:
             continue
-        title = container.removeprefix(f"{ROOMS}.").replace(".", "/")
+        title = container.removeprefix(f"{ROOMS}.").removeprefix(f"{PACKAGE}.").replace(".", "/")
         beside = [f"`{_name(module)}`" for module in sorted(set(_modules(container)) - set(rooms))]
         files = "\n\n" + textwrap.fill(f"Beside them: {', '.join(beside)}.", WIDTH) if beside else ""
         drawn = f"{graph(reduced(room_imports(rooms)))}\n\n" if len(rooms) > 1 else ""
@@ -131,7 +131,7 @@ def rooms_table(rooms: Iterable[str]) -> str:
                 _holds(room),
                 f"{len(modules)}",
                 f"{_rounded(sum(modules.values())):,}",
-                f"`{largest.relative_to(_folder(ROOMS))}`, {_rounded(modules[largest]):,}" if largest else "",
+                f"`{_shown(largest)}`, {_rounded(modules[largest]):,}" if largest else "",
                 f"{len(others)} files, {_rounded(sum(map(_lines, others))):,} lines" if others else "",
             ]
         )
@@ -226,6 +226,11 @@ def _holds(room: str) -> str:
     docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) if file.is_file() else None
     first = " ".join((docstring or "").split("\n\n")[0].split())
     return re.split(r"\.(?: |$)", first)[0].replace("|", "\\|").replace("``", "`")
+
+
+def _shown(path: Path) -> Path:
+    """A module's path below the rooms' folder, or below the repository's."""
+    return path.relative_to(_folder(ROOMS) if path.is_relative_to(_folder(ROOMS)) else ROOT)
 
 
 def _name(module: str) -> str:

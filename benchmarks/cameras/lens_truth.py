@@ -26,7 +26,7 @@ from PIL import Image
 from tables import Row, print_table
 
 from splatpipe.demo import CAPTURE
-from splatpipe.demo.cameras import BrownLens, brown_lens
+from splatpipe.demo.photography.cameras import BrownLens, brown_lens
 from splatpipe.pipeline.sfm.lenses.lens_model import apart_px, simplest
 
 BORDER_PX = 8.0  # marks nearer to the edge are dropped

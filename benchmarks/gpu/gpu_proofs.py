@@ -22,6 +22,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.camera import Camera
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.cuda import cuda
 from splatpipe.pipeline.raster.loss import photo_loss
@@ -125,7 +126,7 @@ def agreement(megapixels: float = 0.4, views: int = 4) -> Iterator[Row]:
     Raises:
         SystemExit: if a difference exceeds its limit.
     """
-    rasterizer.set_threads(os.cpu_count() or 1)
+    _native.set_threads(os.cpu_count() or 1)
     with gpu_scenes.device() as where:
         model = gpu_scenes.gaussians(None, torch.device("cpu"))
         worst: list[str] = []

@@ -23,9 +23,10 @@ from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.raster.cuda import cuda
 from splatpipe.pipeline.raster.cuda.cuda_forecast import Forecast, FrameFacts, FrameSize
 from splatpipe.pipeline.raster.cuda_frame import TILE_PX
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.raster.sky import STEP_PX, SkyLayer, laid_over_nodes
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 

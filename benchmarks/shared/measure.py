@@ -38,6 +38,7 @@ from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.photos.pixels.dataset import IMAGES, MODEL, Split, View, load_views, mask_path
 from splatpipe.pipeline.photos.pixels.images import load_colour, load_mask
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.isa import isa_name
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.train import iteration
@@ -352,7 +353,7 @@ def scratch() -> Iterator[Path]:
 
 def machine(threads: int) -> Row:
     """Describe the machine that the figures were measured on, with its ceilings."""
-    facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": rasterizer.isa_name(), "isas": _native.isas()}
+    facts: Row = {"cpu": cpu_model(), "cores": os.cpu_count(), "isa": isa_name(), "isas": _native.isas()}
     facts |= {"system": f"{platform.system()} {platform.release()}", "versions": versions()}
     facts["load_average"] = os.getloadavg()[0]  # mean of the last minute: well above 0, the machine was not idle
     return facts | measure_ceilings(threads)

@@ -17,10 +17,10 @@ from tables import Row
 from triangle_distances import Surface, spread, surface_of, thinned
 
 from splatpipe.demo import CAPTURE
-from splatpipe.demo.orthographic import AHEAD_M, MARGIN_M, facade_view, top_view, wall_planes
-from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED
-from splatpipe.demo.relief import relief_in
-from splatpipe.demo.visibility import MIN_VIEWS, photos_that_see
+from splatpipe.demo.truth.orthographic import AHEAD_M, MARGIN_M, facade_view, top_view, wall_planes
+from splatpipe.demo.truth.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED
+from splatpipe.demo.truth.relief import relief_in
+from splatpipe.demo.truth.visibility import MIN_VIEWS, photos_that_see
 from splatpipe.pipeline.photos.targets.quadrant_targets import find_quadrant_targets
 
 TOLERANCE_GSD = 2.0  # for clouds and meshes

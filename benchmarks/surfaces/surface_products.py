@@ -24,7 +24,7 @@ import trimesh
 from jaxtyping import Bool, Float64, UInt8
 
 from splatpipe.demo import CAPTURE
-from splatpipe.demo.truth import truth_from_model
+from splatpipe.demo.truth.truth import truth_from_model
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.geometry.similarity import Similarity

@@ -15,11 +15,11 @@ from scipy.spatial import Delaunay
 from surface_measures import near_steps
 from surface_products import Points, Raster
 
-from splatpipe.demo.parallel_view import ParallelView
-from splatpipe.demo.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED, parts_of, unit_normals
-from splatpipe.demo.relief import Relief, surface_model
-from splatpipe.demo.truth import Triangles, centre, true_poses, true_surface
-from splatpipe.demo.visibility import MIN_VIEWS, TrueView, photos_that_see, true_views
+from splatpipe.demo.photography.parallel_view import ParallelView
+from splatpipe.demo.truth.parts import BRICKS, GROUND, HOUSE, PLAIN, SHEETED, SLATED, TILED, parts_of, unit_normals
+from splatpipe.demo.truth.relief import Relief, surface_model
+from splatpipe.demo.truth.truth import Triangles, centre, true_poses, true_surface
+from splatpipe.demo.truth.visibility import MIN_VIEWS, TrueView, photos_that_see, true_views
 
 GSD_M = 0.028  # ground sample distance of the original photos at the house
 STEP_M = 4.0 * GSD_M  # more than roofs (slope 0.9) rise between cells of 2 GSD; chimneys, dormers and walls are higher
@@ -221,7 +221,7 @@ def true_picture(
     """Return the true image on a site's grid, each pixel the mean of its light, and the mask of its valid pixels.
 
     Args:
-        path: An image by ``demo.orthographic``.
+        path: An image by ``demo.truth.orthographic``.
         view: Its view, except for the pixel size.
         site: The product's grid.
     """

@@ -1,8 +1,8 @@
 """Measure CPU seconds of surface model and orthophoto per million cells: ``surface_speed --depths FOLDER``.
 
-FOLDER is written by ``python -m splatpipe.demo.depth_maps`` (extra ``demo``): depth maps of the demo's photos, true or
-with errors (``--noise``), and beside the true ones the undistorted photos. A part of the plot around the house is
-processed on one thread; nearly all photos see all of it.
+FOLDER is written by ``python -m splatpipe.demo.truth.depth_maps`` (extra ``demo``): depth maps of the demo's photos,
+true or with errors (``--noise``), and beside the true ones the undistorted photos. A part of the plot around the house
+is processed on one thread; nearly all photos see all of it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from tables import Row, print_table
 
-from splatpipe.demo.depth_maps import load
+from splatpipe.demo.truth.depth_maps import load
 from splatpipe.pipeline.surface.depths.exposures import exposure_levels
 from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource
 from splatpipe.pipeline.surface.depths.sources import DepthSource, HeightRange, LruCache, MetricMap

@@ -5,10 +5,10 @@ OUT may be any folder with some of ``dsm.tif``, ``ortho.tif``, ``facades.json``,
 photos. Places count if they lie below the flight (within the cameras' hull in plan), at least three photos truly see
 them, and they are not within two cells of a height step, which are counted separately. Missing values count as wrong.
 
-The true images are made by ``python -m splatpipe.demo.orthographic`` (extra ``demo``), the true depths by ``python -m
-splatpipe.demo.depth_maps`` (a CPU minute). Without the images, PSNR, edges and contrasts are not measured, and fail;
-without the depths, they are computed at half the size. The run needs control: its products are compared at their stated
-coordinates. ``--align cameras`` aligns it to the truth by its camera centres instead.
+The true images are made by ``python -m splatpipe.demo.truth.orthographic`` (extra ``demo``), the true depths by
+``python -m splatpipe.demo.truth.depth_maps`` (a CPU minute). Without the images, PSNR, edges and contrasts are not
+measured, and fail; without the depths, they are computed at half the size. The run needs control: its products are
+compared at their stated coordinates. ``--align cameras`` aligns it to the truth by its camera centres instead.
 """
 
 from __future__ import annotations
@@ -224,8 +224,8 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("out", type=Path, help="OUT of a run on the demo capture with its control, or a folder")
     options.add_argument("--products", default=",".join(PRODUCTS), help="which to measure")
-    options.add_argument("--pictures", type=Path, help="folder of true pictures, by splatpipe.demo.orthographic")
-    options.add_argument("--depths", type=Path, help="folder of true depths, by splatpipe.demo.depth_maps")
+    options.add_argument("--pictures", type=Path, help="folder of true pictures, by splatpipe.demo.truth.orthographic")
+    options.add_argument("--depths", type=Path, help="folder of true depths, by splatpipe.demo.truth.depth_maps")
     options.add_argument("--align", choices=("none", "cameras"), default="none")
     options.add_argument("--json", type=Path)
     arguments = options.parse_args()

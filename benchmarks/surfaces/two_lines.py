@@ -141,8 +141,8 @@ def main() -> None:
     options.add_argument("--photos", type=Path, help="OUT with surfaces of the photos' depths")
     options.add_argument("--splat", type=Path, help="OUT with surfaces of the splat's depths")
     options.add_argument("--poisson", type=Path, help="folder of a Poisson mesh of the first line's cloud")
-    options.add_argument("--pictures", type=Path, help="folder of true pictures, by splatpipe.demo.orthographic")
-    options.add_argument("--depths", type=Path, help="folder of true depths, by splatpipe.demo.depth_maps")
+    options.add_argument("--pictures", type=Path, help="folder of true pictures, by splatpipe.demo.truth.orthographic")
+    options.add_argument("--depths", type=Path, help="folder of true depths, by splatpipe.demo.truth.depth_maps")
     options.add_argument("--json", type=Path)
     arguments = options.parse_args()
     lines = {"photos": arguments.photos, "splat": arguments.splat}

@@ -20,9 +20,9 @@ from opened_run import OpenedRun, open_run, write_png
 from scipy.spatial import ConvexHull
 from tables import Row, print_table
 
-from splatpipe.demo.geodesy import Origin
-from splatpipe.demo.scene import building_corners
-from splatpipe.demo.truth import depth_map, true_poses, true_surface, truth_from_model
+from splatpipe.demo.photography.geodesy import Origin
+from splatpipe.demo.site.scene import building_corners
+from splatpipe.demo.truth.truth import depth_map, true_poses, true_surface, truth_from_model
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea, Ring, read_model_area

@@ -27,14 +27,21 @@ from PIL.TiffImagePlugin import IFDRational
 from position_scenes import STATED_M, Scene, draw_scene
 from tables import Row, print_table
 
-from splatpipe.demo.cameras import BrownLens, Pose
 from splatpipe.demo.generate import RTK_XMP, compress, develop
-from splatpipe.demo.geodesy import Origin
-from splatpipe.demo.mesh import WORLD, Builder, paint_faces
-from splatpipe.demo.metadata import EXIF_IFD, GpsPosition, build_exif, build_xmp, position_attributes, with_metadata
-from splatpipe.demo.render import Renderer
-from splatpipe.demo.scene import DemoScene
-from splatpipe.demo.surroundings import GRAVEL, LAWN, SOIL, TERRACE
+from splatpipe.demo.photography.cameras import BrownLens, Pose
+from splatpipe.demo.photography.geodesy import Origin
+from splatpipe.demo.photography.metadata import (
+    EXIF_IFD,
+    GpsPosition,
+    build_exif,
+    build_xmp,
+    position_attributes,
+    with_metadata,
+)
+from splatpipe.demo.photography.render import Renderer
+from splatpipe.demo.site.mesh import WORLD, Builder, paint_faces
+from splatpipe.demo.site.scene import DemoScene
+from splatpipe.demo.site.surroundings import GRAVEL, LAWN, SOIL, TERRACE
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.survey.placing.uncertainty import NORMAL_95

@@ -27,7 +27,7 @@ from splatpipe.pipeline.engine.digests import HashTable, digest
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.runs.runner import versions
 from splatpipe.pipeline.engine.runs.source import open_source
-from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.isa import isa_name
 from splatpipe.stages.line import LINE
 
 VARIANTS = Path(__file__).with_suffix(".toml")
@@ -168,7 +168,7 @@ def cases_of(
         arguments: The parsed command line.
     """
     stages = {stage.name: stage.version for stage in LINE}
-    build = {"stages": stages, "versions": versions(), "isa": rasterizer.isa_name()}
+    build = {"stages": stages, "versions": versions(), "isa": isa_name()}
     digests = {name: contents(path, work, arguments.threads) for name, path in datasets.items()}
     cases = []
     for seed in range(arguments.seeds):

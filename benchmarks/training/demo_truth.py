@@ -29,8 +29,8 @@ from measure import SilentReporter
 from opened_run import OpenedRun, open_run, write_png
 from tables import Row, print_table
 
-from splatpipe.demo.scene import building_corners
-from splatpipe.demo.truth import centre, depth_map, true_poses, true_surface, truth_from_model
+from splatpipe.demo.site.scene import building_corners
+from splatpipe.demo.truth.truth import centre, depth_map, true_poses, true_surface, truth_from_model
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity

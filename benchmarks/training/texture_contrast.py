@@ -19,9 +19,9 @@ from jaxtyping import Bool, Float32
 from opened_run import OpenedRun, open_run, write_png
 from tables import Row, print_table
 
-from splatpipe.demo.house import BRICK, SLATE, TILES
-from splatpipe.demo.scene import building_corners
-from splatpipe.demo.truth import depth_map, true_surface, truth_from_model
+from splatpipe.demo.site.house import BRICK, SLATE, TILES
+from splatpipe.demo.site.scene import building_corners
+from splatpipe.demo.truth.truth import depth_map, true_surface, truth_from_model
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.images import Pixels, reduced_view
 from splatpipe.pipeline.raster.threads import same_bits

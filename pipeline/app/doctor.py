@@ -22,7 +22,7 @@ def examine(place: Path) -> dict[str, JSON]:
     Args:
         place: An OUT, which need not exist yet.
     """
-    from splatpipe.pipeline.raster.rasterizer import isa_name, isa_names
+    from splatpipe.pipeline.raster.isa import isa_name, isa_names
 
     return {
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",

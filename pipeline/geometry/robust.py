@@ -10,19 +10,21 @@ from jaxtyping import Float64
 
 CAUCHY = 2.385  # spreads at which a Cauchy weight is 1/2: 95 % efficiency on Gaussian noise
 MAD_TO_SIGMA = 1.4826  # standard deviation of Gaussian noise over its median absolute deviation
-_LEAST = 1e-9  # residual below which its weight is surely 1
+FLOOR_MEDIANS = 0.1  # of the lengths: a weight that grew on would hold a fit to a single point
+_LEAST = 1e-9  # least residual that is told from 0
 
 
 def cauchy_weights(
-    residuals: Float64[np.ndarray, " n"], spread: float | Float64[np.ndarray, " n"]
+    residuals: Float64[np.ndarray, " n"], spread: float | Float64[np.ndarray, " n"], half_at: float = CAUCHY
 ) -> Float64[np.ndarray, " n"]:
     """Cauchy's weights, which never become 0.
 
     Args:
         residuals: Of any sign.
         spread: Their standard deviation without outliers, in the same unit.
+        half_at: Spreads at which a weight is 1/2.
     """
-    return np.asarray(1.0 / (1.0 + (residuals / (CAUCHY * spread)) ** 2))
+    return np.asarray(1.0 / (1.0 + (residuals / (half_at * spread)) ** 2))
 
 
 def huber_weights(residuals: Float64[np.ndarray, " n"], limit: float) -> Float64[np.ndarray, " n"]:
@@ -33,3 +35,14 @@ def huber_weights(residuals: Float64[np.ndarray, " n"], limit: float) -> Float64
         limit: In the same unit.
     """
     return np.asarray(np.minimum(1.0, limit / np.maximum(np.abs(residuals), _LEAST)))
+
+
+def absolute_weights(lengths: Float64[np.ndarray, " n"], floor: float | None = None) -> Float64[np.ndarray, " n"]:
+    """Weights with which repeated least squares finds the least sum of lengths instead of their squares.
+
+    Args:
+        lengths: Lengths of the residuals.
+        floor: Length below which the weight no longer grows; None for a tenth of the median.
+    """
+    least = FLOOR_MEDIANS * max(float(np.median(lengths)), _LEAST) if floor is None else floor
+    return np.asarray(1.0 / np.maximum(lengths, least))

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from splatpipe.pipeline.geometry.robust import absolute_weights
+
 # Direction of the displayed image's top in the stored pixel grid (x right, y down), by EXIF orientation.
 TOP_OF_ORIENTATION = {
     1: (0.0, -1.0),
@@ -171,7 +173,7 @@ def mean_rotation(rotations: Float64[np.ndarray, "n 3 3"]) -> tuple[Float64[np.n
         mean = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
         cosines = (np.einsum("nij,ij->n", rotations, mean) - 1.0) / 2.0
         angles = np.arccos(np.clip(cosines, -1.0, 1.0))
-        weights = 1.0 / np.maximum(angles, MIN_WEIGHT_RAD)
+        weights = absolute_weights(angles, MIN_WEIGHT_RAD)
     return mean, float(np.median(angles))
 
 
@@ -195,7 +197,7 @@ def _plane_normal(vectors: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarr
     weights = np.ones(len(vectors))
     for _ in range(ROBUST_ROUNDS):
         values, axes = np.linalg.eigh((vectors * weights[:, None]).T @ vectors / weights.sum())
-        weights = 1.0 / np.maximum(np.abs(vectors @ axes[:, 0]), MIN_WEIGHT_RAD)
+        weights = absolute_weights(np.abs(vectors @ axes[:, 0]), MIN_WEIGHT_RAD)
     return axes[:, 0], math.sqrt(max(float(values[0]), 0.0)), math.sqrt(max(float(values[1]), 0.0))
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,8 +14,16 @@ from torch.autograd.function import once_differentiable
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
-from splatpipe.pipeline.raster.gradients import GradientBuffers, add_gradients, can_wait
+from splatpipe.pipeline.raster.gradients import (
+    FusedStep,
+    GradientBuffers,
+    add_gradients,
+    can_fuse,
+    can_wait,
+    rate_columns,
+)
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 _LOGITS = PARAMETERS.index("opacity_logits")
@@ -42,65 +49,40 @@ class UnfinishedRender:
     logits_are_leaf: bool
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
-        """Whether the pass can be fused with a step.
-
-        That requires a step of the visible rows of what was rendered, or of its first rows, without other gradients.
-        """
-        if tuple(parameters) != PARAMETERS or visible is None or visible.data_ptr() != self.visible.data_ptr():
+        """Whether the pass can be fused with a step: of the visible rows, or of the first ones of them."""
+        if visible is None or visible.data_ptr() != self.visible.data_ptr():
             return False
-        rendered = dict(zip(PARAMETERS, self.parameters, strict=True))
-        stepped = [name for name in PARAMETERS if self.logits_are_leaf or name != "opacity_logits"]
-        same = all(parameters[name].data_ptr() == rendered[name].data_ptr() for name in stepped)
-        return same and all(parameters[name].grad is None for name in stepped)
+        return can_fuse(parameters, self.parameters, self.logits_are_leaf)
 
-    def step(
-        self,
-        values: Mapping[str, Tensor],
-        moments: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
-        rates: Mapping[str, Tensor],
-        options: tuple[float, float, float, int],
-        log_scale_limits: tuple[float, float],
-        far: tuple[float, float, float, float] | None,
-    ) -> int:
-        """Finish the pass and step the visible rows of the parameters; the probe gets a sparse gradient.
-
-        Args:
-            values: The parameters, or their first rows.
-            moments: Adam's first and second moments.
-            rates: Learning rate of every value of a row.
-            options: As for ``_native.adam_step``.
-            log_scale_limits: Limits to which the log-scales of these rows are clamped.
-            far: The centre and the unit of ``FarSteps``; None if no steps are lengthened.
-
-        Returns:
-            Number of rows skipped because their gradients were not finite.
-        """
+    def step(self, step: FusedStep) -> None:
+        """Finish the pass and step the visible rows of the parameters; the probe gets a sparse gradient."""
         visible_count = self.frame.visible
         seen = (
             None
             if self.probe is None
             else (torch.empty(visible_count, dtype=torch.int64), torch.empty(visible_count, 2))
         )
+        logits = step.values["opacity_logits"]
         skipped = self.frame.step(
             self.parameters,
-            [values[name].detach() for name in PARAMETERS],
-            [moments[0][name] for name in PARAMETERS],
-            [moments[1][name] for name in PARAMETERS],
-            [rates[name] for name in PARAMETERS],
-            options,
-            log_scale_limits,
-            far,
-            None if self.logits_are_leaf else values["opacity_logits"].grad,
+            [step.values[name].detach() for name in PARAMETERS],
+            [step.means[name] for name in PARAMETERS],
+            [step.squares[name] for name in PARAMETERS],
+            [rate_columns(step.rates[name], step.values[name]) for name in PARAMETERS],
+            step.options,
+            step.log_scale_limits,
+            None if step.far is None else (*step.far.centre, step.far.unit),
+            None if self.logits_are_leaf else logits.grad,
             seen,
         )
+        step.skipped.add_(skipped)
         if self.probe is not None and seen is not None:
-            stepped = int(self.visible[: len(values["means"])].sum())
+            stepped = int(self.visible[: len(logits)].sum())
             rows, means2d = (each[:stepped] for each in seen)
             shape = self.probe.shape
             self.probe.grad = torch.sparse_coo_tensor(
                 rows[None], means2d, shape, is_coalesced=True, check_invariants=False
             )
-        return skipped
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:
         """Finish the pass: add its gradients to those of the parameters, as any backward pass does."""
@@ -149,12 +131,11 @@ class _Rasterize(torch.autograd.Function):
         depths = (torch.empty(h, w), torch.empty(h, w), torch.empty(h, w)) if options.depth else None
         radii, visible = torch.empty(n), torch.empty(n, dtype=torch.uint8)
         part = camera.window
-        pose = np.ascontiguousarray(camera.cam_from_world, np.float64)
         frame = _native.Frame()
         try:
             frame.forward(
                 parameters,
-                (pose, (w, h), (camera.fx, camera.fy, camera.cx, camera.cy)),
+                native_camera(camera),
                 (options.sh_degree, options.antialias, options.near, options.depth_origin, options.background),
                 (colour, alpha, depths, radii, visible),
                 None if part is None else (part.left, part.top, part.whole_width, part.whole_height),

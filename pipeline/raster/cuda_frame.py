@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +26,7 @@ from splatpipe.pipeline.raster.cuda.cuda_api import (
 )
 from splatpipe.pipeline.raster.cuda.cuda_forecast import FrameSize
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions
-from splatpipe.pipeline.raster.gradients import GradientBuffers, add_gradients, can_wait
+from splatpipe.pipeline.raster.gradients import FusedStep, GradientBuffers, add_gradients, can_fuse, can_wait
 from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 TILE_PX = 16  # a tile's side
@@ -68,8 +69,8 @@ class CudaFrame:
             outputs: As above.
             may_shrink: Whether to make chunks smaller if memory is short; a training does that itself, with a warning.
 
-            Raises:
-                torch.OutOfMemoryError: if memory is short and smaller chunks did not help or are not allowed.
+        Raises:
+            torch.OutOfMemoryError: if memory is short and smaller chunks did not help or are not allowed.
         """
         tiles = -(-view.width // TILE_PX) * -(-view.height // TILE_PX)
         size = FrameSize(len(parameters[0]), tiles)
@@ -85,7 +86,7 @@ class CudaFrame:
         *pictures, radii, visible = outputs
         kernels.call(
             "splat_forward",
-            *frame._said(None),
+            *frame.arguments(None),
             ctypes.byref(SplatPictures(*map(kernels.at, pictures))),
             kernels.at(radii),
             kernels.at(visible),
@@ -104,7 +105,7 @@ class CudaFrame:
         """
         back = self.kernels.empty(self.kernels.back_bytes(self.view, len(self.parameters[0]), self.capacity))
         gradients = SplatPictureGradients(*map(self.kernels.at, pictures))
-        self.kernels.call("splat_blend_backward", *self._said(back), ctypes.byref(gradients))
+        self.kernels.call("splat_blend_backward", *self.arguments(back), ctypes.byref(gradients))
         return back
 
     def project_backward(self, back: Tensor) -> tuple[tuple[Tensor, ...], Float[Tensor, "n 2"]]:
@@ -112,16 +113,11 @@ class CudaFrame:
         gradients = tuple(torch.empty_like(tensor) for tensor in self.parameters)
         means2d = torch.empty(len(self.parameters[0]), 2, device=self.kernels.device)
         rows, at = self.kernels.rows(gradients), self.kernels.at(means2d)
-        self.kernels.call("splat_project_backward", *self._said(back), ctypes.byref(rows), at)
+        self.kernels.call("splat_project_backward", *self.arguments(back), ctypes.byref(rows), at)
         return gradients, means2d
 
-    def step(self, back: Tensor, step: SplatStep, means2d: Float[Tensor, "n 2"] | None) -> None:
-        """The same, fused with a step of Adam."""
-        view, _, frame = self._said(back)
-        self.kernels.call("splat_step", view, frame, ctypes.byref(step), self.kernels.at(means2d))
-
-    def _said(self, back: Tensor | None) -> tuple[object, object, object]:
-        """The shot, the parameters and the frame in the form that the library takes."""
+    def arguments(self, back: Tensor | None) -> tuple[object, object, object]:
+        """The view, the parameters and the frame in the form that the library takes."""
         frame = SplatFrame(
             memory=self.kernels.at(self.memory),
             bytes=self.memory.numel(),
@@ -157,32 +153,38 @@ class UnfinishedBackward:
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
         """Whether the pass can be fused with a step: of all or the first rendered rows, without other gradients."""
-        if tuple(parameters) != PARAMETERS:
+        if visible is not None and visible.data_ptr() != self.visible.data_ptr():
             return False
-        rendered = dict(zip(PARAMETERS, self.frame.parameters, strict=True))
-        stepped = [name for name in PARAMETERS if self.logits_are_leaf or name != "opacity_logits"]
-        same = all(
-            parameters[name].data_ptr() == rendered[name].data_ptr() and len(parameters[name]) <= len(rendered[name])
-            for name in stepped
+        return can_fuse(parameters, self.frame.parameters, self.logits_are_leaf)
+
+    def step(self, step: FusedStep) -> None:
+        """Finish the pass and step the parameters; the probe gets their gradient, and zeros for other rows."""
+        frame, kernels, logits = self.frame, self.frame.kernels, step.values["opacity_logits"]
+        sh = torch.as_tensor(step.rates["sh"], dtype=torch.float32).reshape(-1)
+        given = SplatStep(
+            values=kernels.rows([step.values[name] for name in PARAMETERS]),
+            means=kernels.rows([step.means[name] for name in PARAMETERS]),
+            squares=kernels.rows([step.squares[name] for name in PARAMETERS]),
+            rows=len(logits),
+            rate_sh_rest=float(sh[-1]),
+            sparse=step.visible is not None,
+            log_scale_min=step.log_scale_limits[0],
+            log_scale_max=step.log_scale_limits[1],
+            skipped=kernels.at(step.skipped),
         )
-        alone = all(parameters[name].grad is None for name in stepped)
-        return same and alone and (visible is None or visible.data_ptr() == self.visible.data_ptr())
-
-    def step(self, step: SplatStep, logits: Tensor) -> None:
-        """Finish the pass and step the parameters; the probe gets their gradient, and zeros for other rows.
-
-        Args:
-            step: Adam's step; its logit fields are filled in here.
-            logits: The model's logits, with the gain as their gradient if a function of them was rendered.
-        """
+        given.beta1, given.beta2, given.epsilon, given.step = step.options
+        given.rates = (*(float(step.rates[name]) for name in PARAMETERS if name != "sh"), float(sh[0]))
         if not self.logits_are_leaf:
             assert logits.grad is not None
-            step.logit_gain = self.frame.kernels.at(logits.grad)
-            step.logits = self.frame.kernels.at(self.frame.parameters[PARAMETERS.index("opacity_logits")])
-        self.frame.step(self.back, step, self.means2d)
+            given.logit_gain = kernels.at(logits.grad)
+            given.logits = kernels.at(frame.parameters[PARAMETERS.index("opacity_logits")])
+        means = step.values["means"].detach()
+        with nullcontext() if step.far is None else step.far.lengthened(means, step.visible):
+            view, _, memory = frame.arguments(self.back)
+            kernels.call("splat_step", view, memory, ctypes.byref(given), kernels.at(self.means2d))
         if self.probe is not None and self.means2d is not None:
-            if step.rows < len(self.means2d):
-                self.means2d[step.rows :] = 0.0
+            if len(logits) < len(self.means2d):
+                self.means2d[len(logits) :] = 0.0
             self.probe.grad = self.means2d
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:

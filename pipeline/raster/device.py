@@ -13,10 +13,10 @@ from torch import Tensor
 
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.cuda import cuda_driver, cuda_library
 from splatpipe.pipeline.raster.cuda.cuda import kernels_of
 from splatpipe.pipeline.raster.cuda.cuda_forecast import most_pairs_of
+from splatpipe.pipeline.raster.isa import isa_name
 
 DEVICES = ("auto", "cpu", "cuda")
 CPU = torch.device("cpu")
@@ -42,8 +42,17 @@ class Device:
 
     @property
     def kernels(self) -> str:
-        """The instruction set, or the architecture, device and driver: the last bits depend on these."""
-        return rasterizer.kernels_name(self.tensors)
+        """The instruction set, or the architecture, device and driver: the last bits depend on these.
+
+        Raises:
+            ValueError: if there are no kernels for the device.
+        """
+        kernels = kernels_of(self.tensors)
+        if kernels is not None:
+            return kernels.facts.described()
+        if self.tensors.type != "cpu":
+            raise ValueError(f"there are no kernels for {self.tensors}")
+        return isa_name()
 
     def facts(self) -> dict[str, JSON]:
         """The device's entries in a manifest."""

@@ -2,19 +2,59 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
+import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from splatpipe.pipeline.raster.step_lengths import FarSteps
 from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 
+Rate = float | Tensor
+"""A learning rate, or a CPU tensor of them that broadcasts to a row's shape."""
 
+
+@dataclass(frozen=True, eq=False)
+class FusedStep:
+    """A step of Adam over all parameters of the Gaussians, fused with the end of a backward pass.
+
+    Attributes:
+        values: The parameters, or their first rows, changed in place; if a function of the model's logits was rendered,
+            with its derivative as the gradient of the logits.
+        means: First moments of each, changed in place.
+        squares: Second moments of each, changed in place.
+        rates: Learning rates of each: one, or for ``sh`` one per coefficient, the same for all but the first.
+        options: Beta 1, beta 2, epsilon and the step, counted from 1.
+        log_scale_limits: Limits to which the log-scales of the stepped rows are clamped.
+        visible: The rows to step; None for all.
+        far: Lengthens the steps of far means.
+        skipped: Counter to which the rows skipped for their gradients are added.
+    """
+
+    values: Mapping[str, Tensor]
+    means: Mapping[str, Tensor]
+    squares: Mapping[str, Tensor]
+    rates: Mapping[str, Rate]
+    options: tuple[float, float, float, int]
+    log_scale_limits: tuple[float, float]
+    visible: Bool[Tensor, " n"] | None
+    far: FarSteps | None
+    skipped: Int64[Tensor, ""]
+
+
+@runtime_checkable
 class Unfinished(Protocol):
-    """A backward pass that stopped at the screen; each backend has its own step that finishes it."""
+    """A backward pass that stopped at the screen."""
 
     def can_step(self, parameters: Mapping[str, Tensor], visible: Tensor | None) -> bool:
-        """Whether the pass can be fused with a step."""
+        """Whether the pass can be fused with a step of some parameters' visible rows; None for all rows."""
+
+    def step(self, step: FusedStep) -> None:
+        """Finish the pass and step the parameters; the render's probe gets its gradient."""
 
     def finish(self, parameters: Mapping[str, Tensor]) -> None:
         """Finish the pass: add its gradients to those of the parameters, as any backward pass does."""
@@ -52,6 +92,25 @@ def can_wait(wanted: Sequence[bool], leaves: Sequence[bool], probe: Tensor | Non
     return all(wanted) and all(own) and (probe is None or probe.is_leaf)
 
 
+def can_fuse(parameters: Mapping[str, Tensor], rendered: Sequence[Tensor], logits_are_leaf: bool) -> bool:
+    """Whether parameters are those that were rendered, or their first rows, without gradients of their own.
+
+    Args:
+        parameters: The parameters to step.
+        rendered: The rendered parameters, in the order of ``PARAMETERS``.
+        logits_are_leaf: False if a function of the model's logits was rendered, which may be anywhere.
+    """
+    if tuple(parameters) != PARAMETERS:
+        return False
+    return all(
+        parameters[name].data_ptr() == tensor.data_ptr()
+        and len(parameters[name]) <= len(tensor)
+        and parameters[name].grad is None
+        for name, tensor in zip(PARAMETERS, rendered, strict=True)
+        if logits_are_leaf or name != "opacity_logits"
+    )
+
+
 def add_gradients(parameters: Mapping[str, Tensor], gradients: Sequence[Tensor], logits_are_leaf: bool) -> None:
     """Add the gradients of a backward pass to those of the parameters.
 
@@ -67,3 +126,10 @@ def add_gradients(parameters: Mapping[str, Tensor], gradients: Sequence[Tensor],
             parameters[name].grad = gradient * before
         else:
             parameters[name].grad = gradient if before is None else before + gradient
+
+
+def rate_columns(rate: Rate, parameter: Tensor) -> Float[Tensor, " width"]:
+    """The rate of every value of a row."""
+    if not isinstance(rate, Tensor):
+        return torch.full((math.prod(parameter.shape[1:]),), rate, dtype=torch.float32)
+    return torch.as_tensor(rate, dtype=torch.float32).expand(parameter.shape[1:]).reshape(-1).contiguous()

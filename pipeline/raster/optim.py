@@ -10,22 +10,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatpipe.pipeline.raster.autograd import UnfinishedRender
 from splatpipe.pipeline.raster.cuda.cuda import AdamRows, kernels_of
-from splatpipe.pipeline.raster.cuda.cuda_api import SplatStep
-from splatpipe.pipeline.raster.cuda_frame import UnfinishedBackward
 from splatpipe.pipeline.raster.device import take_rows
-from splatpipe.pipeline.raster.gradients import GradientBuffers
+from splatpipe.pipeline.raster.gradients import FusedStep, GradientBuffers, Rate, rate_columns
 from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.raster.step_lengths import FarSteps
-from splatpipe.pipeline.splat.model.gaussians import PARAMETERS
 
 _MEAN = "mean."
 _SQUARE = "square."
 _STEP = "step"
+NO_LIMITS = (-math.inf, math.inf)
 
-Rate = float | Tensor
-"""A learning rate, or a CPU tensor of them that broadcasts to a row's shape."""
 Limits = Mapping[str, tuple[float, float]]
 """Minimum and maximum of the values, by parameter name."""
 
@@ -113,13 +108,14 @@ class Adam:
         if unfinished is not None and not fuses:
             unfinished.finish(parameters)  # before anything is changed, because it needs memory
         self.step_count += 1
-        if isinstance(unfinished, UnfinishedRender) and fuses:
-            self._step_seen(parameters, rates, unfinished, limits, far)
+        if unfinished is not None and fuses:
+            options, scales = (*self.betas, self.epsilon, self.step_count), (limits or {}).get("log_scales", NO_LIMITS)
+            step = FusedStep(parameters, self.mean, self.square, rates, options, scales, visible, far, self._skipped)
+            unfinished.step(step)
+            if kernels_of(self.device) is not None:  # rows not stepped were clamped by their last step
+                return
         else:
             with nullcontext() if far is None else far.lengthened(parameters["means"].detach(), visible):
-                if isinstance(unfinished, UnfinishedBackward) and fuses:
-                    self._step_fused(parameters, rates, unfinished, visible is not None, limits)
-                    return
                 self._step_rows(parameters, rates, visible)
             self._held = None
         if self._held != limits:
@@ -143,7 +139,7 @@ class Adam:
             [_gradient(parameters[name]) for name in names],
             [self.mean[name] for name in names],
             [self.square[name] for name in names],
-            [_columns(rates[name], parameters[name]) for name in names],
+            [rate_columns(rates[name], parameters[name]) for name in names],
             None if visible is None else visible.contiguous().view(torch.uint8),
         )
         options = (*self.betas, self.epsilon, self.step_count)
@@ -153,53 +149,6 @@ class Adam:
         else:
             moments = (rows.means, rows.squares)
             self._skipped += _native.adam_step(rows.values, rows.gradients, *moments, rows.rates, rows.visible, options)
-
-    def _step_seen(
-        self,
-        parameters: Mapping[str, Tensor],
-        rates: Mapping[str, Rate],
-        unfinished: UnfinishedRender,
-        limits: Limits | None,
-        far: FarSteps | None,
-    ) -> None:
-        """Finish a backward pass on the CPU, fused with a step of the visible rows."""
-        self._skipped += unfinished.step(
-            parameters,
-            (self.mean, self.square),
-            {name: _columns(rates[name], parameters[name]) for name in PARAMETERS},
-            (*self.betas, self.epsilon, self.step_count),
-            (limits or {}).get("log_scales", (-math.inf, math.inf)),
-            None if far is None else (*far.centre, far.unit),
-        )
-
-    def _step_fused(
-        self,
-        parameters: Mapping[str, Tensor],
-        rates: Mapping[str, Rate],
-        unfinished: UnfinishedBackward,
-        sparse: bool,
-        limits: Limits | None,
-    ) -> None:
-        """Finish a backward pass on a CUDA device, fused with the step."""
-        low, high = (limits or {}).get("log_scales", (-math.inf, math.inf))
-        sh = torch.as_tensor(rates["sh"], dtype=torch.float32).reshape(-1)
-        kernels = unfinished.frame.kernels
-        step = SplatStep(
-            values=kernels.rows([parameters[name] for name in PARAMETERS]),
-            means=kernels.rows([self.mean[name] for name in PARAMETERS]),
-            squares=kernels.rows([self.square[name] for name in PARAMETERS]),
-            rows=len(self),
-            rate_sh_rest=float(sh[-1]),
-            epsilon=self.epsilon,
-            step=self.step_count,
-            sparse=sparse,
-            log_scale_min=low,
-            log_scale_max=high,
-            skipped=kernels.at(self._skipped),
-        )
-        step.beta1, step.beta2 = self.betas
-        step.rates = (*(float(rates[name]) for name in PARAMETERS if name != "sh"), float(sh[0]))
-        unfinished.step(step, parameters["opacity_logits"])
 
     def _check(
         self, parameters: Mapping[str, Tensor], visible: Bool[Tensor, " n"] | None, stepped: Iterable[str]
@@ -309,10 +258,3 @@ def _is_fused(rates: Mapping[str, Rate], limits: Limits | None) -> bool:
 def _gradient(parameter: Tensor) -> Tensor:
     assert parameter.grad is not None
     return parameter.grad.detach().contiguous()
-
-
-def _columns(rate: Rate, parameter: Tensor) -> Float[Tensor, " width"]:
-    """The rate of every value of a row."""
-    if not isinstance(rate, Tensor):
-        return torch.full((math.prod(parameter.shape[1:]),), rate, dtype=torch.float32)
-    return torch.as_tensor(rate, dtype=torch.float32).expand(parameter.shape[1:]).reshape(-1).contiguous()

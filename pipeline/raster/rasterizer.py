@@ -13,21 +13,10 @@ from splatpipe.pipeline.raster.cuda.cuda import kernels_of
 from splatpipe.pipeline.raster.cuda_frame import render_cuda
 from splatpipe.pipeline.raster.definitions import Render, RenderOptions, check
 from splatpipe.pipeline.raster.gradients import GradientBuffers
-from splatpipe.pipeline.raster.isa import _native, isa_name, isa_names
 from splatpipe.pipeline.raster.reference import render_reference
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
-__all__ = [
-    "GradientBuffers",
-    "Render",
-    "RenderOptions",
-    "free_frames",
-    "isa_name",
-    "isa_names",
-    "kernels_name",
-    "render",
-    "set_threads",
-]
+__all__ = ["Render", "RenderOptions", "render"]
 
 Backend = Literal["auto", "reference", "native", "cuda"]
 
@@ -75,31 +64,3 @@ def render(
     if backend == "reference" or (backend == "auto" and not native_fits):
         return render_reference(gaussians, camera, options, means2d_probe)
     return render_native(gaussians, camera, options, means2d_probe, buffers)
-
-
-def kernels_name(device: torch.device) -> str:
-    """The part of a device that may change the last bits: an instruction set, or a card with its driver.
-
-    Raises:
-        ValueError: if there are no kernels for the device.
-    """
-    kernels = kernels_of(device)
-    if kernels is not None:
-        return kernels.facts.described()
-    if device.type != "cpu":
-        raise ValueError(f"there are no kernels for {device}")
-    return isa_name()
-
-
-def free_frames() -> None:
-    """Free the memory that the CPU kernels keep for later renders; the next render allocates it again."""
-    _native.free_frames()
-
-
-def set_threads(threads: int) -> None:
-    """Set the size of the thread pool that all native kernels share.
-
-    Args:
-        threads: Number of computing threads, including the caller; at least 1.
-    """
-    _native.set_threads(threads)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import cv2
 import torch
 
-from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.isa import _native
 
 
 @contextmanager
@@ -19,7 +19,7 @@ def same_bits(threads: int) -> Iterator[None]:
         threads: Number of threads of the native kernels, at least 1; not restored afterwards.
     """
     before, before_cv2 = torch.get_num_threads(), cv2.getNumThreads()
-    rasterizer.set_threads(threads)
+    _native.set_threads(threads)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)  # the reader's photos are resized on its one thread
     try:

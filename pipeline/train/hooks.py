@@ -69,7 +69,7 @@ class Technique:
         Args:
             photo: The photo as returned by the previous techniques.
             picture: The render that it is compared with.
-            shot: The iteration's photo and render.
+            rendered_view: The iteration's photo and render.
         """
         return photo
 

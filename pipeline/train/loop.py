@@ -24,7 +24,7 @@ from splatpipe.pipeline.train.appearance.exposure import Exposure, exposures_jso
 from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.flatness import ends_at
 from splatpipe.pipeline.train.interrupts import deferred_interrupts
-from splatpipe.pipeline.train.iteration import curve_facts, iterate
+from splatpipe.pipeline.train.iteration import curve_facts
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS
@@ -32,7 +32,6 @@ from splatpipe.pipeline.train.plan.plan import TrainingPlan, load_or_write_plan,
 from splatpipe.pipeline.train.plan.start import read_start
 from splatpipe.pipeline.train.plan.training_order import PhotoOrder, TrainingOrder
 from splatpipe.pipeline.train.plan.windows import TrainingSize
-from splatpipe.pipeline.train.sizing.measure import Step
 from splatpipe.pipeline.train.sizing.planning import PlanningInput, plan_within_budgets
 from splatpipe.pipeline.train.sizing.shortage import iterate_within_memory
 from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, load_checkpoint, save_checkpoint
@@ -76,7 +75,7 @@ class TrainingSetup:
         return None if frozen is None else frozen.to(self.device.tensors)
 
 
-Fit = Callable[[TrainingPlan, PlanningInput, Step, Reporter], TrainingPlan]
+Fit = Callable[[TrainingPlan, PlanningInput, Reporter], TrainingPlan]
 """Adapts a plan to its scene, before the first iteration."""
 
 
@@ -121,12 +120,9 @@ def train_whole(
     free = make_plan(config, views, split, len(start.gaussians), WINDOW_PIXELS[device.name])
     scene = PlanningInput(config, start, trained_on, len(free.test_views), inputs.machine, device)
 
-    def step(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
-        iterate_within_memory(iterate, state, plan, photo, report)
-
     def make() -> TrainingPlan:
         decided = decided_exposure(config, trained_on, dataset, inputs.machine.threads, report)
-        return fit(free.of(decided), replace(scene, config=decided, sky=sky), step, report)
+        return fit(free.of(decided), replace(scene, config=decided, sky=sky), report)
 
     limit = device.memory_limit(config.max_memory_bytes)
     with same_bits(inputs.machine.threads), device.deterministic(), limit:
@@ -160,7 +156,7 @@ def run_training(setup: TrainingSetup, out: Path, report: Reporter) -> TrainStat
     """Train to the end, from the start or from a killed run's checkpoint, and return the final state.
 
     Args:
-        course: The training setup.
+        setup: The training setup.
         out: Folder of the checkpoint and, during training, the decoded photos.
         report: Receives progress and messages.
 
@@ -268,7 +264,7 @@ class Training:
 
     Attributes:
         state: Changed in place.
-        course: The training setup.
+        setup: The training setup.
         path: Path of the checkpoint.
         clock: The training's clock.
     """
@@ -303,7 +299,7 @@ def resume(path: Path, setup: TrainingSetup, report: Reporter) -> TrainState | N
 
     Args:
         path: The checkpoint.
-        course: The training setup; training resumes on its device, whichever device it began on.
+        setup: The training setup; training resumes on its device, whichever device it began on.
         report: Receives warnings.
     """
     device = setup.device
@@ -338,7 +334,7 @@ def optimise(training: Training, photos: PhotoStream, report: Reporter) -> None:
     state, plan, clock = training.state, training.now, training.clock
     with deferred_interrupts() as interrupt:
         for photo in photos:
-            iterate_within_memory(iterate, state, plan, photo, report)
+            iterate_within_memory(state, plan, photo, report)
             state.seconds = clock.seconds()
             if state.history.growth_ended == state.iteration:
                 report_growth_ended(state, plan, report)

@@ -73,7 +73,7 @@ def viewer_scene(
     Args:
         dataset: The folder that `undistort` wrote.
         frame: The frame of `georef`.
-        look: How the model is rendered.
+        rendering: How the model is rendered.
         held_out: Names of the held-out photos.
         gaussians: The number of Gaussians.
         title: The page's title.

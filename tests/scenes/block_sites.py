@@ -12,7 +12,6 @@ from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_split, load_views
 from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.quality.free_space import free_space
-from splatpipe.pipeline.train import loop
 from splatpipe.pipeline.train.blocks.block_windows import WindowScheme, block_windows, coarse_coverages, footage_on
 from splatpipe.pipeline.train.blocks.cells.partition import Cell, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage
@@ -21,6 +20,7 @@ from splatpipe.pipeline.train.blocks.training import BlockTask, SiteParts, train
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.sizing import shortage
 from splatpipe.pipeline.train.state.state import TrainState
 
 WINDOW = 1000  # pixels of a window: four windows in a photo of 72 × 54, and one at half the size
@@ -64,13 +64,13 @@ class Kill(BaseException):
 
 def step_with(patch: pytest.MonkeyPatch, observe: Callable[[TrainState, TrainingPhoto], None]) -> None:
     """Call ``observe`` before each iteration."""
-    step = loop.iterate
+    step = shortage.iterate
 
     def observed_iterate(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         observe(state, photo)
         step(state, plan, photo)
 
-    patch.setattr(loop, "iterate", observed_iterate)
+    patch.setattr(shortage, "iterate", observed_iterate)
 
 
 def coverages_of(site: SiteParts) -> list[PhotoCoverage]:

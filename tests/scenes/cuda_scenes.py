@@ -11,8 +11,9 @@ from splatpipe.pipeline.raster.cuda.cuda_forecast import (
     FrameFacts,
     FrameSize,
 )
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, RenderOptions, render
+from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.train.techniques.dropout import _DropoutLogits
 
 # A step is the rate times a quotient of moments, and Adam divides by small ones: what differs in the tenth place of a

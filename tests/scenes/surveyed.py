@@ -15,7 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from splatpipe.demo import CAPTURE
-from splatpipe.demo.truth import true_surface
+from splatpipe.demo.truth.truth import true_surface
 from splatpipe.pipeline.engine.runs.source import ABSENT
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.photos.files.photo_list import Photo, PhotoList, save_photo_list

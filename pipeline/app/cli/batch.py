@@ -10,13 +10,12 @@ import typer
 
 from splatpipe.pipeline.app.terminal.parameters import (
     ConfigOption,
-    DeviceOption,
     JsonOption,
+    MachineOptions,
     NotifyOption,
     OutArgument,
     PresetOption,
     SetOption,
-    ThreadsOption,
     UntilOption,
 )
 from splatpipe.pipeline.app.terminal.runs import check_stage, overrides, request_of
@@ -56,8 +55,8 @@ def batch(
     config: ConfigOption = None,
     assignments: SetOption = None,
     until: UntilOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
+    *,
+    machine: MachineOptions,
     profile: ProfileOption = None,
     retries: RetriesOption = RETRIES,
     retry_failed: RetryFailedOption = False,
@@ -84,16 +83,16 @@ def batch(
         require_snakemake(where)
         tables = tuple(with_files_from(Path.cwd(), table) for table in overrides(config, assignments, None).tables)
         if where.local:  # problems of the machine or the options are reported now
-            request_of(captures, out, overrides(config, assignments, None).resolve(load_preset(preset)), device)
-        gpu = _uses_gpu(device, where)
+            request_of(captures, out, overrides(config, assignments, None).resolve(load_preset(preset)), machine.device)
+        gpu = _uses_gpu(machine.device, where)
         node_threads, node_memory = where.largest_machine()
         settings = Settings(
             preset=preset,
             tables=tables,
             until=until or "",
-            device=device,
+            device=machine.device,
             gpu=gpu,
-            threads=threads,
+            threads=machine.threads,
             retries=retries,
             retry_failed=retry_failed,
             local=where.local,

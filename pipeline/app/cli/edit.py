@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from splatpipe.pipeline.app.terminal.parameters import JsonOption, ThreadsOption, expand_user
+from splatpipe.pipeline.app.terminal.parameters import FormatOption, JsonOption, ThreadsOption, expand_user
 from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
@@ -37,80 +38,78 @@ SourceArgument = Annotated[
 TargetArgument = Annotated[
     Path, typer.Argument(metavar="OUT", callback=expand_user, help="The new file; its extension sets the format.")
 ]
-BoxOption = Annotated[
-    list[str] | None, _repeated("X1,Y1,X2,Y2", "Keep what is inside a box; with heights: X1,Y1,Z1,X2,Y2,Z2.", CROP)
-]
-PolygonOption = Annotated[
-    list[Path] | None, _repeated("FILE", "Keep what is inside the polygons of a GeoJSON file, in any CRS.", CROP)
-]
-HeightsOption = Annotated[
-    list[str] | None, _repeated("LOW,HIGH", "Keep a range of heights; LOW, or ,HIGH for one limit.", CROP)
-]
-CutBoxOption = Annotated[list[str] | None, _repeated("X1,Y1,X2,Y2", "Remove what is inside a box.", CROP)]
-CutPolygonOption = Annotated[list[Path] | None, _repeated("FILE", "Remove what is inside the polygons.", CROP)]
-MoveOption = Annotated[list[str] | None, _repeated("EAST,NORTH,UP", "Move by a distance in metres.", MOVE)]
-MoveToOption = Annotated[
-    list[str] | None,
-    _repeated("X,Y[,Z]", "Move the splat's centre, or the point of --about, to these coordinates.", MOVE),
-]
-RotateOption = Annotated[
-    list[str] | None,
-    _repeated("DEGREES[,AXIS]", "Rotate anticlockwise as seen from above, or about x, y, z or an axis X,Y,Z.", MOVE),
-]
-ScaleOption = Annotated[
-    list[str] | None, _repeated("FACTOR", "Scale; the splat loses its georeference and metric scale.", MOVE)
-]
-ScaleFromOption = Annotated[
-    tuple[str, str, str] | None,
-    typer.Option(
-        metavar="A B LENGTH",
-        help=(
-            "Scale so that points A and B (X,Y,Z) are LENGTH apart, e.g. 12.40m; A stays fixed, and units become "
-            "metres."
-        ),
-        rich_help_panel=MOVE,
-    ),
-]
-AboutOption = Annotated[
-    list[str] | None,
-    _repeated("X,Y,Z|middle", "Fixed point of the steps that follow. Default: the splat's centre.", MOVE),
-]
-CleanOption = Annotated[bool, typer.Option("--clean", help="Remove floaters and rough edges.", rich_help_panel=REST)]
-MergeOption = Annotated[list[Path] | None, _repeated("FILE", "Add another splat at its georeferenced position.", REST)]
-ReduceOption = Annotated[
-    list[str] | None,
-    _repeated("N|100MB", "Merge neighbouring Gaussians down to N, or until OUT is at most this size.", REST),
-]
 LocalOption = Annotated[
     bool, typer.Option("--local", help="Coordinates are in metres from the splat's origin, not in its CRS.")
-]
-FormatOption = Annotated[
-    str | None,
-    typer.Option("--format", "-f", metavar="NAME", help="Format, if OUT's extension does not set it: spz2, model."),
 ]
 PicturesOption = Annotated[
     bool, typer.Option("--pictures/--no-pictures", help="Write pictures of the splat before and after.")
 ]
 
 
+@dataclass(frozen=True)
+class StepOptions:
+    """The steps of an edit."""
+
+    crop_box: Annotated[
+        list[str] | None, _repeated("X1,Y1,X2,Y2", "Keep what is inside a box; with heights: X1,Y1,Z1,X2,Y2,Z2.", CROP)
+    ] = None
+    crop_polygon: Annotated[
+        list[Path] | None, _repeated("FILE", "Keep what is inside the polygons of a GeoJSON file, in any CRS.", CROP)
+    ] = None
+    crop_heights: Annotated[
+        list[str] | None, _repeated("LOW,HIGH", "Keep a range of heights; LOW, or ,HIGH for one limit.", CROP)
+    ] = None
+    cut_box: Annotated[list[str] | None, _repeated("X1,Y1,X2,Y2", "Remove what is inside a box.", CROP)] = None
+    cut_polygon: Annotated[list[Path] | None, _repeated("FILE", "Remove what is inside the polygons.", CROP)] = None
+    move: Annotated[list[str] | None, _repeated("EAST,NORTH,UP", "Move by a distance in metres.", MOVE)] = None
+    move_to: Annotated[
+        list[str] | None,
+        _repeated("X,Y[,Z]", "Move the splat's centre, or the point of --about, to these coordinates.", MOVE),
+    ] = None
+    rotate: Annotated[
+        list[str] | None,
+        _repeated(
+            "DEGREES[,AXIS]", "Rotate anticlockwise as seen from above, or about x, y, z or an axis X,Y,Z.", MOVE
+        ),
+    ] = None
+    scale: Annotated[
+        list[str] | None, _repeated("FACTOR", "Scale; the splat loses its georeference and metric scale.", MOVE)
+    ] = None
+    scale_from: Annotated[
+        tuple[str, str, str] | None,
+        typer.Option(
+            metavar="A B LENGTH",
+            help=(
+                "Scale so that points A and B (X,Y,Z) are LENGTH apart, e.g. 12.40m; A stays fixed, and units become "
+                "metres."
+            ),
+            rich_help_panel=MOVE,
+        ),
+    ] = None
+    about: Annotated[
+        list[str] | None,
+        _repeated("X,Y,Z|middle", "Fixed point of the steps that follow. Default: the splat's centre.", MOVE),
+    ] = None
+    clean: Annotated[
+        bool,
+        typer.Option("--clean", help="Remove floaters and rough edges.", rich_help_panel=REST),
+    ] = False
+    merge: Annotated[
+        list[Path] | None,
+        _repeated("FILE", "Add another splat at its georeferenced position.", REST),
+    ] = None
+    reduce: Annotated[
+        list[str] | None,
+        _repeated("N|100MB", "Merge neighbouring Gaussians down to N, or until OUT is at most this size.", REST),
+    ] = None
+
+
 def edit(
     context: typer.Context,
     source: SourceArgument,
     out: TargetArgument,
-    crop_box: BoxOption = None,
-    crop_polygon: PolygonOption = None,
-    crop_heights: HeightsOption = None,
-    cut_box: CutBoxOption = None,
-    cut_polygon: CutPolygonOption = None,
-    move: MoveOption = None,
-    move_to: MoveToOption = None,
-    rotate: RotateOption = None,
-    scale: ScaleOption = None,
-    scale_from: ScaleFromOption = None,
-    about: AboutOption = None,
-    clean: CleanOption = False,
-    merge: MergeOption = None,
-    reduce: ReduceOption = None,
+    *,
+    steps: StepOptions,
     local: LocalOption = False,
     format_name: FormatOption = None,
     pictures: PicturesOption = True,
@@ -119,23 +118,7 @@ def edit(
 ) -> None:
     """Crop, clean, move, rotate, scale, merge and reduce a splat, in the order in which the steps are given."""
     with CommandSummary(out, as_json) as done:
-        options = {
-            "crop_box": crop_box,
-            "crop_polygon": crop_polygon,
-            "crop_heights": crop_heights,
-            "cut_box": cut_box,
-            "cut_polygon": cut_polygon,
-            "move": move,
-            "move_to": move_to,
-            "rotate": rotate,
-            "scale": scale,
-            "scale_from": scale_from,
-            "about": about,
-            "clean": clean,
-            "merge": merge,
-            "reduce": reduce,
-        }
-        given = steps_in_order(context.meta[ORDER], options)
+        given = steps_in_order(context.meta[ORDER], vars(steps))
         done.details = facts = _edit(source, (out, format_name), given, (local, pictures, threads))
         _show(facts)
 

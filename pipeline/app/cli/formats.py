@@ -8,13 +8,12 @@ from typing import Annotated, Any
 import typer
 
 from splatpipe.pipeline.app.terminal.parameters import (
-    DeviceOption,
+    FormatOption,
     JsonOption,
-    NotifyOption,
+    MachineOptions,
     OutArgument,
+    SessionOptions,
     SetOption,
-    ThreadsOption,
-    WaitOption,
     expand_user,
 )
 from splatpipe.pipeline.app.terminal.runs import RunSession, existing_request, overrides
@@ -26,10 +25,6 @@ FormatsOption = Annotated[
     typer.Option(
         "--format", "-f", metavar="NAMES", help="Formats to make, separated by commas; existing ones are kept."
     ),
-]
-FormatOption = Annotated[
-    str | None,
-    typer.Option("--format", "-f", metavar="NAME", help="Format, if OUT's extension does not set it: spz2, model."),
 ]
 SplatArgument = Annotated[
     Path,
@@ -44,20 +39,18 @@ def export(
     out: OutArgument,
     formats: FormatsOption,
     assignments: SetOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
-    wait: WaitOption = False,
-    notify: NotifyOption = None,
-    as_json: JsonOption = False,
+    *,
+    machine: MachineOptions,
+    session: SessionOptions,
 ) -> None:
     """Export a finished run in more formats, to OUT/export; docs/formats.md lists which programs read them."""
     from splatpipe.pipeline.app.formats import check_possible, with_formats
 
-    with CommandSummary(out, as_json) as done:
-        done.notify_by(notify)
+    with CommandSummary(out, session.as_json) as done:
+        done.notify_by(session.notify)
         tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
         check_possible(out, formats)
-        with RunSession(existing_request(out, tables, device, threads), wait) as runner:
+        with RunSession(existing_request(out, tables, machine.device, machine.threads), session.wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import typer
 
+from splatpipe.pipeline.app.cli.groups import with_groups
+
 RUN_EXITS = (
     "0 done, 1 the photos or files cannot be used, 2 invalid command line, 3 a stage failed, 4 this machine lacks "
     "something; 130 and 143 stopped: repeat the command to resume."
@@ -165,6 +167,7 @@ def with_help(app: typer.Typer, **how: Any) -> Callable[[Callable[..., None]], C
     def register(function: Callable[..., None]) -> Callable[..., None]:
         page = PAGES[function.__name__]
         sentence = inspect.cleandoc(function.__doc__ or "").partition("\n\n")[0]
-        return app.command(help=f"{sentence}\n\n{page.about}", epilog=page.epilog(), **how)(function)
+        app.command(help=f"{sentence}\n\n{page.about}", epilog=page.epilog(), **how)(with_groups(function))
+        return function
 
     return register

@@ -18,11 +18,10 @@ from splatpipe.pipeline.app.cli.help import with_help
 from splatpipe.pipeline.app.terminal.parameters import (
     BoundaryOption,
     ConfigOption,
-    DeviceOption,
     FpsOption,
     JsonOption,
+    MachineOptions,
     MaxMemoryOption,
-    NotifyOption,
     OutArgument,
     PathOption,
     PhotosArgument,
@@ -31,15 +30,14 @@ from splatpipe.pipeline.app.terminal.parameters import (
     RerunOption,
     SecondsOption,
     SeedOption,
+    SessionOptions,
     SetOption,
     ShardOption,
     SizeOption,
     StillsOption,
     TargetOption,
-    ThreadsOption,
     TimeBudgetOption,
     UntilOption,
-    WaitOption,
     WhatOption,
     expand_user,
     stages,
@@ -111,28 +109,26 @@ def run(
     until: UntilOption = None,
     rerun: RerunOption = None,
     rerun_from: RerunFromOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
+    *,
+    machine: MachineOptions,
     seed: SeedOption = None,
-    wait: WaitOption = False,
-    notify: NotifyOption = None,
-    as_json: JsonOption = False,
+    session: SessionOptions,
 ) -> None:
     """Turn a folder of photos into a Gaussian splat; valid results of earlier runs are reused."""
     from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
     from splatpipe.pipeline.engine.config import load_preset
 
-    with CommandSummary(out, as_json) as done:
-        done.notify_by(notify)
+    with CommandSummary(out, session.as_json) as done:
+        done.notify_by(session.notify)
         assignments = with_budgets(assignments, time_budget, max_memory)
         assignments = with_boundary(assignments, boundary)
         resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
         again = stages_to_rerun(rerun or [], rerun_from, until)
-        request = request_of(photos, out, resolved, device, threads)
+        request = request_of(photos, out, resolved, machine.device, machine.threads)
         require_readable(request)
         require_memory(request, until)
         print_forecast(request, until)
-        with RunSession(request, wait) as runner:
+        with RunSession(request, session.wait) as runner:
             done.outcome = runner.outcome
             runner.walk(until=until, rerun=again)
 
@@ -144,20 +140,16 @@ def demo(
     assignments: SetOption = None,
     time_budget: TimeBudgetOption = None,
     max_memory: MaxMemoryOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
+    *,
+    machine: MachineOptions,
     seed: SeedOption = None,
-    wait: WaitOption = False,
-    notify: NotifyOption = None,
-    as_json: JsonOption = False,
+    session: SessionOptions,
 ) -> None:
     """Run the pipeline on the demo capture that ships with splatpipe."""
     from splatpipe.demo import capture_path
 
-    budgets = {"time_budget": time_budget, "max_memory": max_memory}
-    machine = {"device": device, "threads": threads, "seed": seed}
-    ending = {"wait": wait, "notify": notify, "as_json": as_json}
-    run(capture_path(), out, preset, None, assignments, **budgets, **machine, **ending)
+    given = (capture_path(), out, preset, None, assignments, time_budget, max_memory)
+    run(*given, machine=machine, seed=seed, session=session)
 
 
 @with_help(app)
@@ -166,21 +158,19 @@ def stage(
     out: OutArgument,
     assignments: SetOption = None,
     shard: ShardOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
-    wait: WaitOption = False,
-    notify: NotifyOption = None,
-    as_json: JsonOption = False,
+    *,
+    machine: MachineOptions,
+    session: SessionOptions,
 ) -> None:
     """Run one stage of an existing OUT again, or one of its shards; no other stage except the one that divides it."""
-    with CommandSummary(out, as_json) as done:
-        done.notify_by(notify)
+    with CommandSummary(out, session.as_json) as done:
+        done.notify_by(session.notify)
         check_stage(name)
         if shard is not None and assignments:
             raise UsageError("All shards of a stage have the same options.", hint="Omit either --set or --shard.")
         done.writes_report = shard is None
-        request = existing_request(out, overrides(None, assignments, None).tables, device, threads)
-        with RunSession(request, wait, "" if shard is None else f"{name}.{shard}") as runner:
+        request = existing_request(out, overrides(None, assignments, None).tables, machine.device, machine.threads)
+        with RunSession(request, session.wait, "" if shard is None else f"{name}.{shard}") as runner:
             done.outcome = runner.outcome
             runner.run_alone(name) if shard is None else runner.run_shard(name, shard)
 
@@ -193,18 +183,16 @@ def georef(
         typer.Option(metavar="FILE", help="Control points: gcp_list.txt or CSV; auto, or none. Default: as before."),
     ] = None,
     assignments: SetOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
-    wait: WaitOption = False,
-    notify: NotifyOption = None,
-    as_json: JsonOption = False,
+    *,
+    machine: MachineOptions,
+    session: SessionOptions,
 ) -> None:
     """Georeference a finished run again, with other control points or another CRS. Unaffected results are reused."""
-    with CommandSummary(out, as_json) as done:
-        done.notify_by(notify)
+    with CommandSummary(out, session.as_json) as done:
+        done.notify_by(session.notify)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
         tables = [*control, *overrides(None, assignments, None).tables]
-        with RunSession(existing_request(out, tables, device, threads), wait) as runner:
+        with RunSession(existing_request(out, tables, machine.device, machine.threads), session.wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
 
@@ -247,30 +235,28 @@ def surface(
         ),
     ] = "rim",
     assignments: SetOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
-    wait: WaitOption = False,
-    notify: NotifyOption = None,
-    as_json: JsonOption = False,
+    *,
+    machine: MachineOptions,
+    session: SessionOptions,
 ) -> None:
     """Make surface products of a finished run: orthophoto, surface model, façades, cloud, mesh; sections, volumes."""
     from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measure_surface, measurement_lines
     from splatpipe.pipeline.engine.quantities import parse_length
     from splatpipe.stages.products import options_for
 
-    with CommandSummary(out, as_json) as done:
-        done.notify_by(notify)
+    with CommandSummary(out, session.as_json) as done:
+        done.notify_by(session.notify)
         wanted = MeasurementRequest.of(section or [], volume, base)
         products = "dsm" if products is None and wanted.anything else products
         products_table = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
         tables = [products_table, *overrides(None, assignments, None).tables]
-        request = existing_request(out, tables, device, threads)
+        request = existing_request(out, tables, machine.device, machine.threads)
         check_possible(out, *tables)
-        with RunSession(request, wait) as runner:
+        with RunSession(request, session.wait) as runner:
             done.outcome = runner.outcome
             runner.walk()
             if wanted.anything:
-                measured = measure_surface(out, wanted, threads or available_cores())
+                measured = measure_surface(out, wanted, machine.threads or available_cores())
                 done.details, done.result_lines = {"surface": measured}, measurement_lines(out, measured)
 
 
@@ -288,8 +274,8 @@ def render(
     seconds: SecondsOption = 10.0,
     fps: FpsOption = 25,
     target: TargetOption = None,
-    device: DeviceOption = "auto",
-    threads: ThreadsOption = 0,
+    *,
+    machine: MachineOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Render a film or stills of a finished run: along its cameras, in an orbit, or from a keyframe file."""
@@ -297,7 +283,7 @@ def render(
         from splatpipe.pipeline.app.renders import RenderRequest, render_run
 
         wanted = RenderRequest(path, what, stills, size, seconds, fps, target)
-        done.details = {"render": render_run(out, wanted, threads or available_cores(), device)}
+        done.details = {"render": render_run(out, wanted, machine.threads or available_cores(), machine.device)}
 
 
 @with_help(app)

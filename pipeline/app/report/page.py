@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.page_file import page_text
 from splatpipe.pipeline.app.path_labels import PathLabels
-from splatpipe.pipeline.app.report.capture import capture_chapter, registration_chapter
+from splatpipe.pipeline.app.report.chapters.capture import capture_chapter, registration_chapter
+from splatpipe.pipeline.app.report.chapters.georeferencing import georeferencing_chapter
+from splatpipe.pipeline.app.report.chapters.processing import files_chapter, messages_chapter, processing_chapter
+from splatpipe.pipeline.app.report.chapters.surfaces import surfaces_chapter
+from splatpipe.pipeline.app.report.chapters.training import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs, results_digest
 from splatpipe.pipeline.app.report.facts.wording import count, duration, judged_of, judged_size, length, moment, number
-from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
-from splatpipe.pipeline.app.report.processing import files_chapter, messages_chapter, processing_chapter
-from splatpipe.pipeline.app.report.surfaces import surfaces_chapter
-from splatpipe.pipeline.app.report.training import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.engine.errors import SplatpipeError
 

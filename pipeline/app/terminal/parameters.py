@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -64,15 +65,11 @@ ShardOption = Annotated[
     int | None,
     typer.Option(min=1, metavar="K", help="Run only this shard; other processes may run others at the same time."),
 ]
-DeviceOption = Annotated[str, typer.Option(autocompletion=devices, help="auto, cpu or cuda.")]
 ThreadsOption = Annotated[
     int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. Does not change the result.")
 ]
 SeedOption = Annotated[int | None, typer.Option(min=0, max=2**31 - 1, help="Seed for all random numbers.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout at the end.")]
-WaitOption = Annotated[
-    bool, typer.Option("--wait", help="If another splatpipe is working in OUT, wait for it instead of failing.")
-]
 NotifyOption = Annotated[
     str | None,
     typer.Option(
@@ -130,3 +127,26 @@ TargetOption = Annotated[
         help="Film file (.webm, or .mp4, four times slower) or folder of stills. Default: in OUT/renders.",
     ),
 ]
+FormatOption = Annotated[
+    str | None,
+    typer.Option("--format", "-f", metavar="NAME", help="Format, if OUT's extension does not set it: spz2, model."),
+]
+
+
+@dataclass(frozen=True)
+class MachineOptions:
+    """Where a command computes."""
+
+    device: Annotated[str, typer.Option(autocompletion=devices, help="auto, cpu or cuda.")] = "auto"
+    threads: ThreadsOption = 0
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """How a command works in OUT, and how it ends."""
+
+    wait: Annotated[
+        bool, typer.Option("--wait", help="If another splatpipe is working in OUT, wait for it instead of failing.")
+    ] = False
+    notify: NotifyOption = None
+    as_json: JsonOption = False

@@ -110,7 +110,7 @@ class _Part:
     Args:
         begin: Its first frame's index.
         sharpness: Of each frame.
-        dull: Whether each is blurred.
+        blurry: Whether each is blurred.
         steps: From frame to frame; the first does not count.
     """
 

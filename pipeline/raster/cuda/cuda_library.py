@@ -57,8 +57,8 @@ class CudaLibrary:
     Args:
         path: Path of the shared object.
 
-        Raises:
-            MachineError: if it is missing, cannot be loaded, or has a different interface version.
+    Raises:
+        MachineError: if it is missing, cannot be loaded, or has a different interface version.
     """
 
     def __init__(self, path: Path) -> None:

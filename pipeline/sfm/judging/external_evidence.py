@@ -11,6 +11,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON
+from splatpipe.pipeline.geometry.robust import absolute_weights
 from splatpipe.pipeline.sfm.judging.judging import Reason, is_trusted
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
@@ -111,10 +112,10 @@ def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray
         places: Their stated positions, metres, in the same order.
     """
     weights = np.ones(len(centres))
-    for _ in range(IRLS_ROUNDS):  # iteratively reweighted least squares
+    for _ in range(IRLS_ROUNDS):
         residuals = _similar(centres, places, weights) - places
         lengths = np.linalg.norm(residuals, axis=1)
-        weights = 1.0 / np.maximum(lengths, 0.1 * max(float(np.median(lengths)), 1e-9))
+        weights = absolute_weights(lengths)
     median = float(np.median(lengths))
     distances = np.linalg.norm(places[:, None] - places[None], axis=2)
     np.fill_diagonal(distances, np.inf)

@@ -21,6 +21,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Bool, Float64, Int64
 
+from splatpipe.pipeline.geometry.robust import absolute_weights
 from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 from splatpipe.pipeline.sfm.judging.agreement import EXPLAINED_PX, Agreement, Rays, compare, contradicting
 from splatpipe.pipeline.sfm.judging.cuts import find_cut
@@ -168,7 +169,7 @@ def move_group(
         held = np.concatenate([rows, [[0.0, 0.0, 0.0, WEAK_SCALE]]]), np.append(values, WEAK_SCALE)
         found = np.linalg.lstsq(*held, rcond=None)[0]
         off = np.linalg.norm(left @ found - right, axis=1)
-        weights = 1.0 / np.maximum(off, 0.1 * max(float(np.median(off)), 1e-9))
+        weights = absolute_weights(off)
         weights /= weights.max()
     turned, centres = here.turns.copy(), here.centres.copy()
     rows_of = list(group)

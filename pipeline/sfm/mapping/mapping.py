@@ -36,7 +36,7 @@ class MappingOptions:
         min_model_size: Models with fewer photos are dropped.
         relaxed: Accept fewer inliers and a lower inlier ratio for a photo's pose (incremental only).
         hold_focal: Keep focal lengths at the database's values.
-        coarseness: Factor by which pixel thresholds are wider than usual (incremental only).
+        pixel_tolerance_scale: Factor by which pixel thresholds are wider than usual (incremental only).
     """
 
     seed: int = 0

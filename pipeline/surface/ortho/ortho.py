@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from rasterio.windows import Window
 
 from splatpipe.pipeline.engine.stage import Reporter
@@ -22,7 +22,6 @@ from splatpipe.pipeline.surface.depths.site_extent import SiteExtent
 from splatpipe.pipeline.surface.depths.sources import LruCache
 from splatpipe.pipeline.surface.heights.dsm import CACHE_BYTES, height_range
 from splatpipe.pipeline.surface.heights.height_field import HeightField
-from splatpipe.pipeline.surface.ortho.known_cells import KnownCells, known_cells
 from splatpipe.pipeline.surface.ortho.mosaic import MARGIN
 from splatpipe.pipeline.surface.ortho.orthophoto import EXTENDED_CELLS, TILE, OrthoInput, orthophotos
 from splatpipe.pipeline.surface.rasters.geotiff import COLOURS, gdal, open_raster, raster_file
@@ -32,6 +31,7 @@ from splatpipe.pipeline.surface.sheets.raster_plane import GridSheet, divide_int
 from splatpipe.pipeline.surface.sheets.sheet_work import Arrays, SheetWork
 
 PIXEL_BYTES = 1 << 30  # limit for decoded photos in memory; beyond it, all are kept on disk
+BLOCK = 64  # cells a side that are known together: a plan of 16 million cells is 4,000 blocks
 HEIGHT_MARGIN_CELLS = 3  # margin in cells of the surface model around the pixels, for interpolation
 
 
@@ -95,6 +95,38 @@ def make_ortho(task: OrthoTask, work: Path, out: Path, report: Reporter) -> dict
         "exposures_stops": round(float(np.ptp(np.log2(levels.gain[:, 1]))), 3) if len(photos) else 0.0,
         "crs": grid.crs.horizontal.name,
     }
+
+
+@dataclass(frozen=True, eq=False)
+class KnownCells:
+    """Where a surface model has heights, in coarse blocks of its cells.
+
+    Attributes:
+        blocks: Whether any cell of each block has a height.
+    """
+
+    blocks: Bool[np.ndarray, "rows columns"]
+
+    def any_in(self, part: Tile) -> bool:
+        """Whether any block that overlaps a part has heights; there are none outside of the raster."""
+        rows = slice(max(part.row, 0) // BLOCK, max(part.row + part.height - 1, -1) // BLOCK + 1)
+        columns = slice(max(part.column, 0) // BLOCK, max(part.column + part.width - 1, -1) // BLOCK + 1)
+        return bool(self.blocks[rows, columns].any())
+
+
+def known_cells(dsm: Path) -> KnownCells:
+    """Read where a surface model has heights.
+
+    Args:
+        dsm: A tiled GeoTIFF of heights; it is read once, one row of blocks at a time.
+    """
+    with gdal(dsm.parent), open_raster(dsm) as raster:
+        rows = []
+        for top in range(0, raster.height, BLOCK):
+            window = Window(0, top, raster.width, min(BLOCK, raster.height - top))
+            known = raster.read_masks(1, window=window).any(axis=0)
+            rows.append(np.logical_or.reduceat(known, np.arange(0, raster.width, BLOCK)))
+    return KnownCells(np.stack(rows))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ import pycolmap
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
+from splatpipe.pipeline.geometry.robust import cauchy_weights
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED
 from splatpipe.pipeline.survey.adjustment.block import Block
@@ -243,7 +244,7 @@ def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) ->
         scale, rotation, translation = fit_similarity(new, old, weights)
         back = Similarity(float(scale), rotation, translation).apply(new)
         distance = np.linalg.norm(back - old, axis=1)
-        weights = 1.0 / (1.0 + (distance / max(float(np.median(distance)), 1e-300)) ** 2)
+        weights = cauchy_weights(distance, max(float(np.median(distance)), 1e-300), half_at=1.0)
     place = {number: k for k, number in enumerate(numbers)}
     squares: list[Float64[np.ndarray, " n"]] = []
     for number in sorted(before.reg_image_ids()):

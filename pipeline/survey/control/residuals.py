@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-
-from splatpipe.pipeline.survey.control.confidence import rmse_interval
+from scipy.special import gammaincinv
 
 DIGITS = 6  # decimals of lengths in metres
+CONFIDENCE = 0.95
 
 
 def accuracy_table(residuals: Float64[np.ndarray, "n 3"]) -> dict[str, Any] | None:
@@ -40,6 +41,23 @@ def accuracy_table(residuals: Float64[np.ndarray, "n 3"]) -> dict[str, Any] | No
         "mean_m": [round(float(each.mean()), DIGITS) if len(each) else None for each in (east, north, up)],
         "flights": [],
     }
+
+
+def rmse_interval(rmse: float, values: int) -> tuple[float, float]:
+    """Return the 95 % confidence interval of the standard deviation behind an RMSE of normal residuals.
+
+    Args:
+        rmse: Root mean square of ``values`` independent residuals of mean zero.
+        values: Number of residuals; at least one.
+    """
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = chi_squared_quantile(1.0 - tail, values), chi_squared_quantile(tail, values)
+    return rmse * math.sqrt(values / low), rmse * math.sqrt(values / high)
+
+
+def chi_squared_quantile(probability: float, degrees: int) -> float:
+    """Return the quantile of the chi-squared distribution, of which half is gamma-distributed."""
+    return 2.0 * float(gammaincinv(degrees / 2.0, probability))
 
 
 def _rms(values: Float64[np.ndarray, " n"]) -> float | None:

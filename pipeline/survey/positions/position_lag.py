@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Complex128, Float64, Int64
 
+from splatpipe.pipeline.geometry.robust import absolute_weights
 from splatpipe.pipeline.survey.crs.readings import Evidence, Reading, plausible
 from splatpipe.pipeline.survey.positions.flight_steps import MIN_STEPS, FlightSteps
 
@@ -107,5 +108,5 @@ def _misfits(
         a, b = ours - share @ ours, theirs - share @ theirs
         factor = np.vdot(a, share * b) / max(float((share * np.abs(a) ** 2).sum()), 1e-300)
         off = b - (factor if turning else max(factor.real, 0.0)) * a
-        weights = 1.0 / np.maximum(np.abs(off), MIN_WEIGHT_M)
+        weights = absolute_weights(np.abs(off), MIN_WEIGHT_M)
     return np.asarray(np.abs(off))

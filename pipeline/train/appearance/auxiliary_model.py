@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatpipe.pipeline.raster.optim import Adam, Rate
+from splatpipe.pipeline.raster.gradients import Rate
+from splatpipe.pipeline.raster.optim import Adam
 
 _MOMENTS = "adam."
 

@@ -129,7 +129,7 @@ class RobustMask(Technique):
         Args:
             photo: The photo.
             rendered: Its rendered view, with depths.
-            shown: The render as compared with the photo.
+            rendered_colour: The render as compared with the photo.
         """
         with torch.no_grad():
             row = self._row[photo.camera.name]

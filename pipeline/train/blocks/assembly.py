@@ -1,13 +1,21 @@
-"""Joining trained blocks into the output of a whole training: model, history, plan and auxiliary models."""
+"""Merging trained blocks into the output of a whole training: model, history, plan and auxiliary models.
+
+A block trains its cell and a margin, so that Gaussians at its border are trained with those on the other side; only
+the Gaussians whose centres lie in its cell are used. Blocks are merged in order of their numbers, whatever the order of
+training. Models are read one at a time, once to count and once to write.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import torch
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.files.json_file import json_text, read_json
@@ -16,8 +24,8 @@ from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, read_splat, write_splat_parts
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.cells.site_plan import SitePlan, load_site_plan
-from splatpipe.pipeline.train.blocks.merging import count_and_degree, own_pieces
 
 OF_ALL = ("sky.npz", "exposures.json", "rendering.json")  # copied from the coarse pass, which covers the whole scene
 FROM_COARSE = ("sky_photos", "device", "instruction_set", "mode")
@@ -49,6 +57,51 @@ def assemble(inputs: Inputs, out: Path, report: Reporter) -> Summary:
     write_file(out / "plan.json", json_text(plans))
     most = sum(block.share for block in site.blocks)
     return {"gaussians": count, "blocks": len(inputs.shards), **_summary(inputs, history, most)}
+
+
+def owned(partition: Partition, block: int, gaussians: Gaussians) -> Gaussians:
+    """The Gaussians of a block's model that lie in its own cell, in their order.
+
+    Args:
+        partition: The cells.
+        block: The block's number.
+        gaussians: The trained model: cell, margin, and Gaussians that moved out of both.
+    """
+    owners = partition.owners(gaussians.means.detach().double().numpy(force=True))
+    return gaussians.select(torch.from_numpy(np.flatnonzero(owners == block)))
+
+
+def count_and_degree(partition: Partition, read: Callable[[int], Gaussians]) -> tuple[int, int]:
+    """The number of Gaussians of the whole scene, and their SH degree.
+
+    Args:
+        partition: The cells.
+        read: As for ``own_pieces``.
+
+    Raises:
+        ValueError: if the SH degrees differ.
+    """
+    found = [_count(partition, block, read(block)) for block in range(len(partition.cells))]
+    if len({degree for _count_of_own, degree in found}) != 1:
+        raise ValueError("blocks are of several SH degrees")
+    return sum(count for count, _degree in found), found[0][1]
+
+
+def own_pieces(partition: Partition, read: Callable[[int], Gaussians]) -> Iterator[Gaussians]:
+    """The whole scene, piece by piece; each model is freed before the next is read.
+
+    Args:
+        partition: The cells.
+        read: Reads a block's trained model by number, without frozen Gaussians.
+    """
+    for block in range(len(partition.cells)):
+        yield from (owned(partition, block, piece) for piece in read(block).pieces())
+
+
+def _count(partition: Partition, block: int, model: Gaussians) -> tuple[int, int]:
+    """Number of a model's Gaussians in its own cell, and its SH degree."""
+    means = (piece.means.detach().double().numpy(force=True) for piece in model.pieces())
+    return sum(int((partition.owners(each) == block).sum()) for each in means), model.sh_degree
 
 
 def _require_all(site: SitePlan, shards: Sequence[Path]) -> None:

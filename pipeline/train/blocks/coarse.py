@@ -22,7 +22,6 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.start import started
 from splatpipe.pipeline.train.plan.windows import TrainingSize
-from splatpipe.pipeline.train.sizing.measure import Step
 from splatpipe.pipeline.train.sizing.planning import PlanningInput
 
 SKIES = "skies.npz"
@@ -55,7 +54,7 @@ def train_coarse(config: TrainConfig, inputs: Inputs, limits: TrainingLimits, ou
         SplatpipeError, MachineError, KeyboardInterrupt: as ``loop.run``.
     """
 
-    def fit(plan: TrainingPlan, scene: PlanningInput, _step: Step, _report: Reporter) -> TrainingPlan:
+    def fit(plan: TrainingPlan, scene: PlanningInput, _report: Reporter) -> TrainingPlan:
         return coarse_plan(plan, scene, limits)
 
     unhurried = config.model_copy(update={"time_budget_s": 0.0})

@@ -1,7 +1,7 @@
 """Training one block of a scene: its own Gaussians, on the windows that show its cell, with all else frozen.
 
 It continues where the coarse pass ended (``schedules.py``), with that pass's sky and exposures. Its output covers only
-its cell and margin; ``merging.py`` joins the cells.
+its cell and margin; ``assembly.py`` joins the cells.
 """
 
 from __future__ import annotations

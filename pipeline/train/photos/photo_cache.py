@@ -1,25 +1,20 @@
-"""Decoded photos in an unnamed file, read through windows that are mapped only while in use."""
+"""Decoded photos on the disk, read through windows."""
 
 from __future__ import annotations
 
-import mmap
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
+from splatpipe.pipeline.photos.pixels.mapped_file import MappedFile, whole_pages
 from splatpipe.pipeline.train.plan.windows import PixelRectangle
-
-SHARE_OF_FREE = 0.5  # largest share of the disk's free space: checkpoints and the model need room too
 
 
 @dataclass(frozen=True)
@@ -32,15 +27,11 @@ class _CachedPhoto:
 
 def stored_bytes(camera: Camera, has_mask: bool) -> int:
     """Bytes that a photo takes in the file: three per pixel, one more with a mask, rounded up to whole pages."""
-    used = camera.width * camera.height * (4 if has_mask else 3)
-    return -(-used // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+    return whole_pages(camera.width * camera.height * (4 if has_mask else 3))
 
 
 class PhotoCache:
-    """8-bit photos, each stored once and read any number of times.
-
-    The file has no name, so the system frees it when it is closed or the process dies in any way; another run never
-    sees it. A window is mapped only while it is in use, because mapped pages count as the process's memory.
+    """8-bit photos in a ``MappedFile``, each stored once and read any number of times.
 
     Args:
         folder: Folder on the disk to use.
@@ -57,8 +48,8 @@ class PhotoCache:
         self._slots: dict[tuple[int, int], _CachedPhoto] = {}
         self._end = 0
         with self._explained():
-            self.room_bytes = int(SHARE_OF_FREE * shutil.disk_usage(folder).free)
-            self._file = tempfile.TemporaryFile(dir=folder, prefix="photos-", buffering=0)  # noqa: SIM115
+            self._file = MappedFile(folder)
+        self.room_bytes = self._file.room_bytes
 
     def close(self) -> None:
         """Free the disk space. Arrays already read stay valid."""
@@ -81,9 +72,9 @@ class PhotoCache:
         if not self.has_room(camera, slot.has_mask):
             return
         with self._explained():
-            self._write(colour, slot.offset)
+            self._file.write(colour, slot.offset)
             if mask is not None:
-                self._write(mask, slot.offset + colour.nbytes)
+                self._file.write(mask, slot.offset + colour.nbytes)
         self._slots[key] = slot
         self._end = slot.offset + stored_bytes(camera, slot.has_mask)
 
@@ -120,22 +111,11 @@ class PhotoCache:
             return colour, None
         return colour, self._rows(slot.offset + 3 * width * height, frame, width).view(np.bool_)[:, columns]
 
-    def _rows(self, offset: int, frame: PixelRectangle, row_bytes: int) -> npt.NDArray[np.uint8]:
+    def _rows(self, offset: int, frame: PixelRectangle, row_bytes: int) -> UInt8[np.ndarray, "rows bytes"]:
         """A frame's rows of the plane at ``offset`` in the file."""
-        begin = offset + frame.top * row_bytes
-        before = begin % mmap.ALLOCATIONGRANULARITY
-        length = frame.height * row_bytes
         with self._explained():
-            mapped = mmap.mmap(
-                self._file.fileno(), before + length, mmap.MAP_SHARED, mmap.PROT_READ, offset=begin - before
-            )
-        return np.frombuffer(mapped, np.uint8, length, before).reshape(frame.height, row_bytes)
-
-    def _write(self, data: Pixels | Mask, offset: int) -> None:
-        rest = data.data.cast("B")
-        while rest:
-            written = os.pwrite(self._file.fileno(), rest, offset)
-            rest, offset = rest[written:], offset + written
+            rows = self._file.read(offset + frame.top * row_bytes, frame.height * row_bytes)
+        return rows.reshape(frame.height, row_bytes)
 
     @contextmanager
     def _explained(self) -> Iterator[None]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import torch
 
+from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.photos.pixels.images import reduced_view
 from splatpipe.pipeline.raster import rasterizer
@@ -22,6 +23,7 @@ from splatpipe.pipeline.train.photos.upload import Uploader
 from splatpipe.pipeline.train.plan.budget import SMALLEST_MEGAPIXELS, Speed, Timing, fit_speed
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import Schedule
+from splatpipe.pipeline.train.sizing.shortage import iterate_within_memory
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.pipeline.train.techniques.techniques import make_techniques
 
@@ -34,8 +36,6 @@ PILOT_ITERATION = 10  # iteration that the pilot's state claims, so that all SH 
 WINDOW_SIDE = 2  # divisor of the sides of the timed windows
 SPLIT_SHRINK = 0.25  # fall of log scales per log of growth: between clones, which keep their size, and splits (0.5)
 STREAM = 7  # added to the seed for the jitter's random numbers; the pilot is thrown away, nothing depends on them
-
-Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,14 @@ class TimedScene:
     sky: SkyModel | None = None
 
 
-def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: MeasuringBudget) -> MachineSpeed:
+def measure(plan: TrainingPlan, subject: TimedScene, effort: MeasuringBudget, report: Reporter) -> MachineSpeed:
     """Time real iterations at two sizes, on windows of the larger one, and at two numbers of Gaussians.
 
     Args:
         plan: A plan without a budget; its cap is the larger number of Gaussians.
         subject: The scene to time.
-        step: A training iteration.
         effort: The time limit.
+        report: Receives warnings about a lack of memory.
     """
     start, views, device = subject.start, subject.views, subject.device
     began = time.monotonic()
@@ -100,8 +100,8 @@ def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: Measuri
     counts = sorted({min(len(start), plan.options.max_gaussians), plan.options.max_gaussians})
     models = [stretched(start, count, plan.options.seed) for count in counts]
     states = [_pilot_state(model.to(device.tensors), trial, subject) for model in models]
-    _warm_up(states, trial, small, step, began + WARM_UP_SHARE * effort.most_s)
-    first = _timed(states[0], trial, small[0], step, device)
+    _warm_up(states, trial, small, began + WARM_UP_SHARE * effort.most_s, report)
+    first = _timed(states[0], trial, small[0], device, report)
     # Cost grows slightly slower than size, so the line through two sizes is accurate only near them.
     megapixels = SMALLEST_MEGAPIXELS * max(2.0, effort.iteration_s / first.seconds)
     large, decode_s = _photos(chosen, megapixels, device)
@@ -111,7 +111,7 @@ def measure(plan: TrainingPlan, subject: TimedScene, step: Step, effort: Measuri
     timings = [first]
     for photos in zip(small, large, map(middle_of, large), strict=True):
         for state in states:
-            timings += [_timed(state, trial, photo, step, device) for photo in photos]
+            timings += [_timed(state, trial, photo, device, report) for photo in photos]
         if time.monotonic() - began > effort.most_s:
             break
     return MachineSpeed(fit_speed(timings), decode_s, evaluate_s)
@@ -148,12 +148,12 @@ def _pilot_state(start: Gaussians, trial: TrainingPlan, subject: TimedScene) -> 
 
 
 def _warm_up(
-    states: Sequence[TrainState], trial: TrainingPlan, photos: Sequence[TrainingPhoto], step: Step, until: float
+    states: Sequence[TrainState], trial: TrainingPlan, photos: Sequence[TrainingPhoto], until: float, report: Reporter
 ) -> None:
     """Train each state briefly: opacities and sizes cost more once they have moved from their initial values."""
     for number in range(WARM_UP_ITERATIONS):
         for state in states:
-            step(state, trial, photos[number % len(photos)])
+            iterate_within_memory(state, trial, photos[number % len(photos)], report)
         if time.monotonic() > until:
             break
 
@@ -181,10 +181,10 @@ def middle_of(photo: TrainingPhoto) -> TrainingPhoto:
     return TrainingPhoto(camera.crop(left, top, width, height), colour, mask, photo.is_empty, None, share)
 
 
-def _timed(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto, step: Step, device: Device) -> Timing:
+def _timed(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto, device: Device, report: Reporter) -> Timing:
     device.wait()
     began = time.monotonic()
-    step(state, trial, photo)
+    iterate_within_memory(state, trial, photo, report)
     device.wait()
     seconds = time.monotonic() - began
     pixels, whole = photo.camera.width * photo.camera.height, photo.camera.uncropped()

@@ -20,7 +20,7 @@ from splatpipe.pipeline.train.plan.limits import FIRST_ITERATIONS, device_bytes_
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of
 from splatpipe.pipeline.train.plan.start import InitialGaussians, started
 from splatpipe.pipeline.train.plan.windows import TrainingSize
-from splatpipe.pipeline.train.sizing.measure import MachineSpeed, MeasuringBudget, Step, TimedScene, measure
+from splatpipe.pipeline.train.sizing.measure import MachineSpeed, MeasuringBudget, TimedScene, measure
 from splatpipe.pipeline.train.sizing.shortage import HINT
 from splatpipe.pipeline.train.state.memory import within_memory
 
@@ -58,13 +58,12 @@ class PlanningInput:
     sky: SkyModel | None = None
 
 
-def plan_within_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
+def plan_within_budgets(plan: TrainingPlan, scene: PlanningInput, report: Reporter) -> TrainingPlan:
     """Fit a plan to the budgets of its options, and its initial Gaussians to the cap.
 
     Args:
         plan: A plan with resolved schedules.
         scene: The scene to train.
-        step: A training iteration, to be timed.
         report: Receives warnings.
 
     Raises:
@@ -73,12 +72,12 @@ def plan_within_budgets(plan: TrainingPlan, scene: PlanningInput, step: Step, re
     if plan.options.max_memory_bytes:
         plan = within_memory(plan, scene.start.sparse, report, scene.device.name == "cuda")
     if plan.options.time_budget_s:
-        plan = within_time(plan, scene, step, report)
+        plan = within_time(plan, scene, report)
     start = scene.start
     return replace(plan, initial_gaussians=started(start.sparse, start.dense, plan.options.max_gaussians))
 
 
-def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Reporter) -> TrainingPlan:
+def within_time(plan: TrainingPlan, scene: PlanningInput, report: Reporter) -> TrainingPlan:
     """The plan that fills the time budget left after reserving time for the last stages."""
     budget, began = plan.options.time_budget_s, time.monotonic()
     if 0.0 < scene.machine.began_s < began:
@@ -91,7 +90,7 @@ def within_time(plan: TrainingPlan, scene: PlanningInput, step: Step, report: Re
     trial = pilot(plan, scene)
     subject = TimedScene(scene.start.within(trial.options.max_gaussians), scene.trained_on, scene.device, scene.sky)
     try:
-        measured = measure(trial, subject, step, effort)
+        measured = measure(trial, subject, effort, report)
     except torch.OutOfMemoryError as error:
         raise MachineError(
             f"The graphics card has too little memory for the trial run that plans --time-budget, of "

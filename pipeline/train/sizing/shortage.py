@@ -7,13 +7,13 @@ can be restarted with less. Growth that does not fit is not such a case: it is f
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
 
 import torch
 
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
+from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.budget import MIN_GAUSSIANS
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
@@ -22,16 +22,11 @@ from splatpipe.pipeline.train.state.state import TrainState
 KEPT_SHARE = 0.9  # share of the Gaussians kept each time, the most opaque: those lost are the least visible
 HINT = "Lower train.max_megapixels or train.max_gaussians, or close other programs that use the graphics card."
 
-Step = Callable[[TrainState, TrainingPlan, TrainingPhoto], None]
 
-
-def iterate_within_memory(
-    step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter
-) -> None:
+def iterate_within_memory(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, report: Reporter) -> None:
     """Run an iteration, restarting it with less if the device's memory is too small.
 
     Args:
-        step: The iteration.
         state: As for ``iteration.iterate``.
         plan: The training plan.
         photo: The photo to train on.
@@ -42,7 +37,7 @@ def iterate_within_memory(
     """
     kernels, now = kernels_of(state.gaussians.means.device), state.iteration + 1
     pairs = 0 if kernels is None else kernels.forecast.most_pairs
-    while not _fits(step, state, plan, photo):
+    while not _fits(state, plan, photo):
         # Not inside the except block: the error keeps the iteration's tensors alive.
         state.roll_back()
         if state.gaussians.means.device.type == "cuda":
@@ -56,11 +51,11 @@ def iterate_within_memory(
         )
 
 
-def _fits(step: Step, state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> bool:
+def _fits(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> bool:
     steps, count = state.adam.step_count, len(state.gaussians)
     model = weakref.ref(state.gaussians)  # weak, because density control needs the old model's memory
     try:
-        step(state, plan, photo)
+        iterate(state, plan, photo)
     except torch.OutOfMemoryError as error:
         if state.adam.step_count == steps and state.gaussians is model():
             return False

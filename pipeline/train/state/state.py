@@ -13,8 +13,10 @@ from torch import Tensor
 from splatpipe.pipeline.engine.errors import card_fault
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.device import CPU, take_rows
+from splatpipe.pipeline.raster.gradients import GradientBuffers
+from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, Render, free_frames
+from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.raster.step_lengths import FarSteps
 from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 from splatpipe.pipeline.splat.model.sh import coefficient_count
@@ -201,7 +203,7 @@ class TrainState:
 
     def _densify(self, plan: TrainingPlan, limit: int, iteration: int) -> None:
         """Give the model the rows that density control chooses, at most ``limit`` if it adds any."""
-        free_frames()  # they change size in this step, and memory is tight until then
+        _native.free_frames()  # they change size in this step, and memory is tight until then
         try:
             growth, counts = self._growth(plan, limit, iteration)
         except torch.OutOfMemoryError:  # the device has not even room to select what to grow

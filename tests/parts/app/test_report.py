@@ -21,10 +21,10 @@ from PIL import Image
 
 from splatpipe.demo import capture_path
 from splatpipe.pipeline.app.report import is_current, make_report, write_report
-from splatpipe.pipeline.app.report.capture import unit_of
+from splatpipe.pipeline.app.report.chapters.capture import unit_of
+from splatpipe.pipeline.app.report.chapters.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.charts.pictures import CROP_SIDE_PX, MAX_CROPS, chosen_views, cut_crops
 from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
-from splatpipe.pipeline.app.report.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.page import report_page
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.app.terminal.console import show_bad_cameras

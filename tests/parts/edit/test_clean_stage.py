@@ -9,7 +9,7 @@ import pytest
 import tiny_scene
 import torch
 
-from splatpipe.pipeline.app.report.training import removed_in_words
+from splatpipe.pipeline.app.report.chapters.training import removed_in_words
 from splatpipe.pipeline.edit.options import CleanConfig
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Machine

@@ -24,6 +24,7 @@ from splatpipe.pipeline.film.options import FlythroughConfig
 from splatpipe.pipeline.film.photo_route import photo_film
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.device import cpu
@@ -303,5 +304,5 @@ def test_threads_do_not_change_a_film(tmp_path: Path) -> None:
         with same_bits(threads):
             flythrough.run(FlythroughConfig(seconds=0.4), inputs, folder / "out", tiny_scene.Recorder())
         films.append((folder / "out" / "film" / "flythrough.webm").read_bytes())
-    rasterizer.set_threads(1)
+    _native.set_threads(1)
     assert films[0] == films[1]

@@ -23,8 +23,8 @@ from pyproj import Transformer
 from rays import first_hits
 
 from splatpipe.demo import CAPTURE, capture_path
-from splatpipe.demo.cameras import BrownLens, brown_lens, flight
-from splatpipe.demo.metadata import read_dji, write_rtk_variant
+from splatpipe.demo.photography.cameras import BrownLens, brown_lens, flight
+from splatpipe.demo.photography.metadata import read_dji, write_rtk_variant
 from splatpipe.pipeline.sfm.lenses.lens_model import apart_px, simplest
 
 Array = NDArray[np.float64]

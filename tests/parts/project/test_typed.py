@@ -64,4 +64,9 @@ def test_the_namespace_itself_can_be_checked(user_python: Path) -> None:
     search, _ = get_search_dirs(str(user_python))
     finder = FindModuleCache(SearchPaths((), (), tuple(search), ()), FileSystemCache(), Options())
     found = {source.module for source in finder.find_modules_recursive("splatpipe")}  # as mypy -p does
-    assert {"splatpipe", "splatpipe.pipeline.app.cli.main", "splatpipe.stages.line", "splatpipe.demo.scene"} <= found
+    assert {
+        "splatpipe",
+        "splatpipe.pipeline.app.cli.main",
+        "splatpipe.stages.line",
+        "splatpipe.demo.site.scene",
+    } <= found

@@ -25,8 +25,7 @@ from splatpipe.pipeline.surface.heights.dsm import DsmTask, make_dsm
 from splatpipe.pipeline.surface.heights.heights import HeightInput, tile_heights
 from splatpipe.pipeline.surface.options import DsmConfig
 from splatpipe.pipeline.surface.ortho import ortho as ortho_file
-from splatpipe.pipeline.surface.ortho.known_cells import known_cells
-from splatpipe.pipeline.surface.ortho.ortho import OrthoTask, make_ortho
+from splatpipe.pipeline.surface.ortho.ortho import OrthoTask, known_cells, make_ortho
 from splatpipe.pipeline.surface.rasters.grid import make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 from splatpipe.pipeline.surface.sheets.raster_plane import divide_into_sheets

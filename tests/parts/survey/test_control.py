@@ -28,7 +28,7 @@ from surveyed import (
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Inputs, Summary
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
-from splatpipe.pipeline.survey.control.confidence import chi_squared_quantile, rmse_interval
+from splatpipe.pipeline.survey.control.residuals import chi_squared_quantile, rmse_interval
 from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.survey.files.scale_bars import ScaleBar
 from splatpipe.pipeline.survey.options import GeorefConfig

@@ -17,6 +17,7 @@ from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.raster.rasterizer import render
 from splatpipe.pipeline.splat.containers.ply import write_splat, write_splat_parts
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.assembly import count_and_degree, own_pieces, owned
 from splatpipe.pipeline.train.blocks.cells.cutting import BINS, cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.cells.needs import (
     BlockNeed,
@@ -32,7 +33,6 @@ from splatpipe.pipeline.train.blocks.cells.photo_coverage import PhotoCoverage, 
 from splatpipe.pipeline.train.blocks.cells.surroundings import visible_around
 from splatpipe.pipeline.train.blocks.cells.thinning import thinned
 from splatpipe.pipeline.train.blocks.cells.visibility import block_views, windows
-from splatpipe.pipeline.train.blocks.merging import count_and_degree, own_pieces, owned
 from splatpipe.pipeline.train.plan.limits import FIXED_BYTES
 
 UP = np.array([0.0, 0.0, 1.0])

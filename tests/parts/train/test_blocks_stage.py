@@ -14,7 +14,7 @@ import tiny_scene
 import torch
 from block_scene import OPTIONS, QUICK, SHARDS, prepared
 
-from splatpipe.pipeline.app.report import training
+from splatpipe.pipeline.app.report.chapters import training
 from splatpipe.pipeline.engine.errors import StageError, UsageError
 from splatpipe.pipeline.engine.runs.lock import locked_shard
 from splatpipe.pipeline.engine.stage import Inputs, Machine

@@ -52,7 +52,7 @@ from splatpipe.pipeline.train.plan.limits import (
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, duration, make_plan
 from splatpipe.pipeline.train.plan.schedule import resolve_schedule
 from splatpipe.pipeline.train.plan.start import InitialGaussians
-from splatpipe.pipeline.train.sizing import planning
+from splatpipe.pipeline.train.sizing import planning, shortage
 from splatpipe.pipeline.train.sizing.measure import MachineSpeed, middle_of
 from splatpipe.pipeline.train.state import memory
 from splatpipe.pipeline.train.state.memory import resident_bytes
@@ -323,7 +323,7 @@ def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
     scene: Path, tmp_path: Path, plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained(scene, tmp_path / "whole", plan, monkeypatch)
-    step = loop.iterate
+    step = shortage.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == 31:
@@ -333,7 +333,7 @@ def test_a_killed_training_keeps_its_plan_and_ends_with_the_same_bits(
     with monkeypatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "iterate", dying)
+        patch.setattr(shortage, "iterate", dying)
         trained(scene, tmp_path / "killed", plan, patch)
     assert (tmp_path / "killed" / loop.CHECKPOINT).exists()
     recorder = trained(scene, tmp_path / "killed", plan, monkeypatch)

@@ -11,11 +11,11 @@ from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.render.rendering import render_depth
 from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
+from splatpipe.pipeline.train.blocks.assembly import count_and_degree, own_pieces
 from splatpipe.pipeline.train.blocks.cells.cutting import cut, shares, site, work_map
 from splatpipe.pipeline.train.blocks.cells.partition import Border, Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import photo_coverages
 from splatpipe.pipeline.train.blocks.cells.visibility import block_views, windows
-from splatpipe.pipeline.train.blocks.merging import count_and_degree, own_pieces
 
 
 def merged(partition: Partition, trained: Mapping[int, Gaussians]) -> Gaussians:

@@ -17,6 +17,7 @@ from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.lengths import Stretch
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import resolve_schedule
+from splatpipe.pipeline.train.sizing import shortage
 from splatpipe.pipeline.train.state.history import History
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
@@ -188,7 +189,7 @@ def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
     scene: Path, tmp_path: Path, config: TrainConfig, before_end: int
 ) -> None:
     whole, _ = trained(scene, tmp_path / "whole", config)
-    step = loop.iterate
+    step = shortage.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == int(str(whole["iterations"])) - before_end:
@@ -198,7 +199,7 @@ def test_a_killed_training_ends_early_at_the_same_iteration_with_the_same_bits(
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "iterate", dying)
+        patch.setattr(shortage, "iterate", dying)
         trained(scene, tmp_path / "killed", config)
     resumed, _ = trained(scene, tmp_path / "killed", config)
     assert resumed["iterations"] == whole["iterations"] and resumed["flat_at"] == whole["flat_at"]

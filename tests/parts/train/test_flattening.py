@@ -28,6 +28,7 @@ from splatpipe.pipeline.train.appearance.exposure import Exposure, exposures_jso
 from splatpipe.pipeline.train.flattening import MIN_ITERATIONS, TrainedParts, flatten, flattening_plan, options_of
 from splatpipe.pipeline.train.options import SplatDepthsConfig
 from splatpipe.pipeline.train.plan.lengths import WINDOW_PIXELS
+from splatpipe.pipeline.train.sizing import shortage
 from splatpipe.pipeline.train.techniques.distortion_loss import FREE_PX, HALF_PX, depth_origin, spread_loss
 from splatpipe.pipeline.train.techniques.smoothness_loss import unevenness
 from splatpipe.stages import splat_depths
@@ -164,7 +165,7 @@ def test_copy_is_flatter_and_the_same_for_any_threads_and_after_a_kill(
     assert len(model) == len(before)
     # A tenth of the shipped length reduces it by a tenth.
     assert spread_of(model, parts["undistort.dataset"]) < 0.95 * spread_of(before, parts["undistort.dataset"])
-    real = loop.iterate
+    real = shortage.iterate
 
     def killed(state, *arguments) -> None:  # type: ignore[no-untyped-def]
         real(state, *arguments)
@@ -172,7 +173,7 @@ def test_copy_is_flatter_and_the_same_for_any_threads_and_after_a_kill(
             os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(loop, "iterate", killed)
+        patch.setattr(shortage, "iterate", killed)
         flatten(trained(parts), Machine("cpu", 2), twice, tiny_scene.Recorder())
     assert (twice / loop.CHECKPOINT).is_file()
     again = flatten(trained(parts), Machine("cpu", 2), twice, tiny_scene.Recorder())

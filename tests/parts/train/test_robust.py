@@ -28,6 +28,7 @@ from splatpipe.pipeline.train.appearance.robust import (
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import ScheduleStep
+from splatpipe.pipeline.train.sizing import shortage
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
 
@@ -250,14 +251,14 @@ def trained(scene: Path, out: Path, robust: float, iterations: int = 400) -> Tra
     parts |= tiny_scene.split_part(scene / "dataset", names=held_out)
     inputs = Inputs(parts, scene, machine=Machine("cpu", 1))
     kept: list[TrainState] = []
-    step = loop.iterate
+    step = shortage.iterate
 
     def keeping(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         kept[:] = [state]
         step(state, plan, photo)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "iterate", keeping)
+        patch.setattr(shortage, "iterate", keeping)
         config = tiny_scene.plain(iterations=iterations, robust=robust)
         summary = dict(train.run(config, inputs, out, tiny_scene.Recorder()))
     model = read_splat(out / "model.ply")
@@ -288,14 +289,14 @@ def test_killed_training_leaves_out_the_same_and_ends_with_the_same_bits(scene: 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        step = loop.iterate
+        step = shortage.iterate
 
         def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
             if state.iteration == 71:
                 raise KeyboardInterrupt
             step(state, plan, photo)
 
-        patch.setattr(loop, "iterate", dying)
+        patch.setattr(shortage, "iterate", dying)
         trained(scene, tmp_path / "killed", 0.05, 120)
     killed = trained(scene, tmp_path / "killed", 0.05, 120)
     for part in ("model.ply", "history.json"):

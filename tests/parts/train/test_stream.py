@@ -18,9 +18,9 @@ import torch
 
 from splatpipe.pipeline.engine.errors import MachineError, StageError
 from splatpipe.pipeline.geometry.camera import Camera, reduced_size
+from splatpipe.pipeline.photos.pixels import mapped_file
 from splatpipe.pipeline.photos.pixels.dataset import View, load_views
 from splatpipe.pipeline.photos.pixels.images import load_colour, load_mask, reduced_camera, reduced_view
-from splatpipe.pipeline.train.photos import photo_cache
 from splatpipe.pipeline.train.photos.stream import PhotoStream, TrainingPhoto
 from splatpipe.pipeline.train.plan.training_order import PhotoOrder
 from splatpipe.pipeline.train.plan.windows import TrainingSize
@@ -251,7 +251,7 @@ def test_photos_that_do_not_fit_on_the_disk_are_decoded_again_with_a_note(
     usual = streamed(views, cache, [0] * 30)
     free = shutil.disk_usage(cache).free
     for room, warnings in ((30_000, 1), (0, 1), (1 << 20, 0)):
-        monkeypatch.setattr(photo_cache, "SHARE_OF_FREE", room / free)
+        monkeypatch.setattr(mapped_file, "SHARE_OF_FREE", room / free)
         recorder = tiny_scene.Recorder()
         with PhotoStream.over(views, [TrainingSize()] * 30, 0, 1, cache) as photos:
             photos.warn_if_disk_full(recorder)

@@ -17,7 +17,7 @@ from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.mvs.options import InitializeConfig
 from splatpipe.pipeline.photos.pixels.dataset import load_views
 from splatpipe.pipeline.photos.pixels.images import load_colour
-from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster import device, rasterizer
 from splatpipe.pipeline.render.rendering import load_rendering
 from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.quality import metrics
@@ -26,6 +26,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan import plan as planned
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
+from splatpipe.pipeline.train.sizing import shortage
 from splatpipe.pipeline.train.state.checkpoint import load_checkpoint
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
@@ -118,7 +119,7 @@ class Kill(BaseException):
 
 def die_at(monkeypatch: pytest.MonkeyPatch, iteration: int, how: Callable[[], None]) -> None:
     """Run ``how`` in the middle of an iteration, with a checkpoint after every earlier one."""
-    step = loop.iterate
+    step = shortage.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == iteration:
@@ -127,7 +128,7 @@ def die_at(monkeypatch: pytest.MonkeyPatch, iteration: int, how: Callable[[], No
 
     monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-    monkeypatch.setattr(loop, "iterate", dying)
+    monkeypatch.setattr(shortage, "iterate", dying)
 
 
 def killed() -> None:
@@ -196,7 +197,7 @@ def test_resuming_with_another_instruction_set_is_reported(
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         die_at(patch, 20, killed)
         trained(scene, tmp_path)
-    monkeypatch.setattr(rasterizer, "isa_name", lambda: "other")
+    monkeypatch.setattr(device, "isa_name", lambda: "other")
     recorder = tiny_scene.Recorder()
     train.run(QUICK, make_inputs(scene), tmp_path, recorder)
     assert len(recorder.warnings) == 1 and "resumes on other" in recorder.warnings[0]

@@ -23,7 +23,6 @@ from splatpipe.pipeline.raster.cuda import cuda_driver, cuda_library
 from splatpipe.pipeline.raster.cuda.cuda import use_kernels
 from splatpipe.pipeline.raster.device import Device, choose_device, cpu, take_rows, taken_in_place
 from splatpipe.pipeline.train.densify import DensifiedGaussians, along_curve
-from splatpipe.pipeline.train.iteration import iterate
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.upload import QUEUED, Upload, Uploader, colours_of
 from splatpipe.pipeline.train.plan import limits
@@ -292,7 +291,7 @@ def test_a_trial_that_does_not_fit_on_the_device_is_reported(monkeypatch: pytest
 
     monkeypatch.setattr(planning, "measure", measure)
     with pytest.raises(MachineError, match=r"too little memory for the trial .* of 9,000 Gaussians") as failure:
-        planning.within_time(*budgeted(60.0, cpu()), iterate, tiny_scene.Recorder())
+        planning.within_time(*budgeted(60.0, cpu()), tiny_scene.Recorder())
     assert "train.max_megapixels" in failure.value.hint
 
 

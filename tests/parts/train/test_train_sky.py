@@ -32,6 +32,7 @@ from splatpipe.pipeline.train.appearance.sky_file import read_skies, write_skies
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
+from splatpipe.pipeline.train.sizing import shortage
 from splatpipe.pipeline.train.sizing.measure import MeasuringBudget, TimedScene, measure
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import evaluate, initialize, train
@@ -236,7 +237,7 @@ class Kill(BaseException):
 
 @pytest.mark.parametrize("when", [2, 25])
 def test_killed_training_resumes_with_the_same_bits(scene: Path, tmp_path: Path, when: int) -> None:
-    step = loop.iterate
+    step = shortage.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == when:
@@ -246,7 +247,7 @@ def test_killed_training_resumes_with_the_same_bits(scene: Path, tmp_path: Path,
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "iterate", dying)
+        patch.setattr(shortage, "iterate", dying)
         trained(scene, tmp_path / "killed")
     digest, recorder = trained(scene, tmp_path / "killed", threads=2)
     assert not recorder.warnings
@@ -291,7 +292,9 @@ def test_held_out_views_are_rendered_with_the_sky(scene: Path, tmp_path: Path) -
     assert render[-20:].max() == 0.0
 
 
-def test_a_budget_measures_iterations_with_the_sky_and_does_not_change_it(scene: Path) -> None:
+def test_a_budget_measures_iterations_with_the_sky_and_does_not_change_it(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     views, start = load_views(scene / "dataset"), read_splat(scene / "init.ply")
     sky = SkyModel.begin(views, scene / "dataset", 1)
     assert sky is not None
@@ -299,13 +302,14 @@ def test_a_budget_measures_iterations_with_the_sky_and_does_not_change_it(scene:
         make_plan(QUICK, views, tiny_scene.split_of(views), len(start)),
         sky.panorama.colours.detach().clone(),
     )
-    moved = []
+    moved, iterate = [], shortage.iterate
 
-    def step(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto) -> None:
-        loop.iterate(state, trial, photo)
+    def watched(state: TrainState, trial: TrainingPlan, photo: TrainingPhoto) -> None:
+        iterate(state, trial, photo)
         trained = state.techniques.find(SkyModel)
         assert trained is not None
         moved.append(not torch.equal(trained.panorama.colours, before))
 
-    measure(plan, TimedScene(start, views, cpu(), sky), step, MeasuringBudget(0.0, 1e-3))
+    monkeypatch.setattr(shortage, "iterate", watched)
+    measure(plan, TimedScene(start, views, cpu(), sky), MeasuringBudget(0.0, 1e-3), tiny_scene.Recorder())
     assert any(moved) and torch.equal(sky.panorama.colours, before)

@@ -21,6 +21,7 @@ from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import Schedule
 from splatpipe.pipeline.train.plan.windows import TrainingSize, windows_of
+from splatpipe.pipeline.train.sizing import shortage
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import initialize, train
 
@@ -93,7 +94,7 @@ def test_killed_training_on_windows_ends_with_the_same_bits_on_any_number_of_thr
 ) -> None:
     config = tiny_scene.plain(iterations=60, **TECHNIQUES)
     whole = trained(scene, tmp_path / "whole", config)
-    step = loop.iterate
+    step = shortage.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
         if state.iteration + 1 == 37:
@@ -103,7 +104,7 @@ def test_killed_training_on_windows_ends_with_the_same_bits_on_any_number_of_thr
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "iterate", dying)
+        patch.setattr(shortage, "iterate", dying)
         trained(scene, tmp_path / "killed", config)
     assert (tmp_path / "killed" / loop.CHECKPOINT).exists()
     assert digests(trained(scene, tmp_path / "killed", config, threads=3)) == digests(whole)

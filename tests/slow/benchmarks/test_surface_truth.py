@@ -21,11 +21,11 @@ from surface_scene import GSD_M, SceneTruth, TruthGrid, site_of, straight, true_
 from surface_truth import Demand, measure
 from triangle_distances import spread, surface_of
 
-from splatpipe.demo import depth_maps, parts
-from splatpipe.demo.orthographic import AHEAD_M, facade_view, top_view, views, wall_planes
-from splatpipe.demo.relief import relief, relief_in
-from splatpipe.demo.truth import Triangles, depth_map, true_surface
-from splatpipe.demo.visibility import TrueView, photos_that_see
+from splatpipe.demo.truth import depth_maps, parts
+from splatpipe.demo.truth.orthographic import AHEAD_M, facade_view, top_view, views, wall_planes
+from splatpipe.demo.truth.relief import relief, relief_in
+from splatpipe.demo.truth.truth import Triangles, depth_map, true_surface
+from splatpipe.demo.truth.visibility import TrueView, photos_that_see
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.survey.crs.world import open_world

@@ -18,7 +18,7 @@ from playwright.sync_api import Page
 from served import Served, reserved_port, serving
 
 from splatpipe.demo import CAPTURE, capture_path
-from splatpipe.demo.truth import true_poses
+from splatpipe.demo.truth.truth import true_poses
 from splatpipe.pipeline.app.view.marking.photo import without_metadata
 
 TWELVE = ("P01", "P02", "P03", "P04", "P05", "P06", "P07", "P08", "P15", "P16", "P17", "P18")

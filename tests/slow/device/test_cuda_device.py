@@ -16,9 +16,10 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.raster.cuda import cuda, cuda_library
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.loss import SSIM_REACH_PX, Rectangle, photo_loss
 from splatpipe.pipeline.raster.optim import Adam
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions
+from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sh import coefficient_count
 from splatpipe.pipeline.splat.quality import metrics

@@ -133,5 +133,5 @@ def test_a_memory_limit_holds(device: Device) -> None:
         assert free is not None and 0 < free <= 96 * MEGABYTE
         silent = Silent()
         for photo in given:
-            iterate_within_memory(iterate, training, plan, photo, silent)
+            iterate_within_memory(training, plan, photo, silent)
     assert training.iteration == 3 and torch.cuda.max_memory_reserved() <= limit + 2 * MEGABYTE

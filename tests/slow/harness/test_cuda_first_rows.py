@@ -11,8 +11,9 @@ from random_scene import random_camera, random_scene
 from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.techniques.dropout import _DropoutLogits
 

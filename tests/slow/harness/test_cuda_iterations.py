@@ -15,9 +15,11 @@ from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.raster.colour import affine_colour
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of, use_kernels
 from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
+from splatpipe.pipeline.raster.device import Device
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, kernels_name, render
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 MIN_PSNR = 60.0  # agreement of a device's render with the CPU's, dB: an eighth of a step of eight bits
@@ -130,8 +132,8 @@ def test_the_device_is_named(place):
     with use_kernels(place.kernels):
         kernels = kernels_of(place.device)
         assert kernels is not None
-        assert kernels_name(place.device) == kernels.facts.described()
-    assert kernels_name(place.device).startswith("cuda sm_") == (place.device.type == "cuda")
+        assert Device("", place.device).kernels == kernels.facts.described()
+    assert Device("", place.device).kernels.startswith("cuda sm_") == (place.device.type == "cuda")
 
 
 def test_waiting_is_forbidden_despite_torchs_note_and_allowed_again_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,10 +26,12 @@ from splatpipe.pipeline.raster.cuda.cuda_forecast import (
     most_pairs_of,
 )
 from splatpipe.pipeline.raster.cuda_frame import shot_of
-from splatpipe.pipeline.raster.device import cpu
+from splatpipe.pipeline.raster.device import Device, cpu
+from splatpipe.pipeline.raster.gradients import GradientBuffers
+from splatpipe.pipeline.raster.isa import isa_name
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, isa_name, kernels_name, render
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 
@@ -222,15 +224,15 @@ def test_an_empty_model_is_the_background(kernels):
 
 def test_kernels_get_only_supported_inputs(kernels):
     with use_kernels(kernels):
-        assert kernels_name(torch.device("cpu")) == kernels.facts.described()
+        assert Device("", torch.device("cpu")).kernels == kernels.facts.described()
         doubles = random_scene(0).to(dtype=torch.float64)
         assert render(doubles, CAMERA, OPTIONS).colour.dtype == torch.float64
         with pytest.raises(ValueError, match="float64"):
             render(doubles, CAMERA, OPTIONS, backend="cuda")
         with pytest.raises(ValueError, match="a tensor on meta"):
             photo_loss(torch.rand(9, 9, 3), torch.rand(9, 9, 3, device="meta"))
-    assert kernels_name(torch.device("cpu")) == isa_name()
+    assert Device("", torch.device("cpu")).kernels == isa_name()
     with pytest.raises(ValueError, match="no CUDA kernels"):
         render(random_scene(0), CAMERA, OPTIONS, backend="cuda")
     with pytest.raises(ValueError, match="no kernels for meta"):
-        kernels_name(torch.device("meta"))
+        _ = Device("", torch.device("meta")).kernels

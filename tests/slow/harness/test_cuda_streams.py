@@ -18,9 +18,10 @@ from splatpipe.pipeline.raster.cuda import cuda, cuda_forecast
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, use_kernels
 from splatpipe.pipeline.raster.cuda.cuda_api import CALLS, SplatFrameFacts
 from splatpipe.pipeline.raster.cuda.cuda_forecast import FrameSize, PendingFacts
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes
 
 CAMERA, OPTIONS = random_camera(0), RenderOptions(3, depth=False)

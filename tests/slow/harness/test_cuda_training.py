@@ -33,7 +33,7 @@ from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.sizing import shortage
-from splatpipe.pipeline.train.sizing.measure import Step
+from splatpipe.pipeline.train.sizing.measure import MeasuringBudget, TimedScene, measure
 from splatpipe.pipeline.train.sizing.planning import PlanningInput
 from splatpipe.pipeline.train.state import state
 from splatpipe.pipeline.train.state.checkpoint import load_checkpoint, save_checkpoint
@@ -149,7 +149,7 @@ def killed_at(when: int) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Kill):
         patch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(loop, "CHECKPOINT_SHARE", 1e9)
-        patch.setattr(loop, "iterate", dying)
+        patch.setattr(shortage, "iterate", dying)
         yield
 
 
@@ -178,7 +178,7 @@ def test_resuming_on_another_device_is_reported(scene: Path, tmp_path: Path) -> 
 
 
 ASKED_OF_THE_CPU = {  # numbers on the host: learning rates, and values that arrived from the device long ago
-    "optim.py:_step_fused",
+    "cuda_frame.py:step",
     "optim.py:_is_fused",
     "cuda_forecast.py:facts",
 }
@@ -273,13 +273,11 @@ def test_a_budgets_trial_also_uses_smaller_chunks_if_memory_is_short(
     begun, shot = tiny_scene.true_model(), shot_of(tiny_scene.cameras()[0], RenderOptions(3, depth=False), 16)
     kernels = ShortOfMemory(library_on_cpu(), torch.device("cpu"))
     kernels.most_frame_bytes = kernels.frame_bytes(shot, len(begun), 2 * len(begun))
-    photo = TrainingPhoto(tiny_scene.cameras(4)[0], torch.full((tiny_scene.HEIGHT, tiny_scene.WIDTH, 3), 0.5), None)
 
-    def tried(plan: TrainingPlan, given: PlanningInput, step: Step, report: tiny_scene.Recorder) -> TrainingPlan:
-        pilot = make_small_plan(ALL)  # without density control so early
-        trial = TrainState.begin(begun, pilot, Techniques())
-        step(trial, pilot, photo)
-        assert trial.iteration == 1 and len(trial.gaussians) == len(begun)
+    def tried(plan: TrainingPlan, given: PlanningInput, report: tiny_scene.Recorder) -> TrainingPlan:
+        subject = TimedScene(begun, given.trained_on, given.device)
+        pilot = make_small_plan(ALL.model_copy(update={"max_gaussians": len(begun)}))
+        measure(pilot, subject, MeasuringBudget(0.0, 1e-3), report)
         return plan
 
     monkeypatch.setattr(loop, "plan_within_budgets", tried)
@@ -330,7 +328,7 @@ def test_a_memory_limit_applies_to_the_training_only(
             raise MachineError("It fails.")
         iterate(state, plan, photo)
 
-    monkeypatch.setattr(loop, "iterate", watched)
+    monkeypatch.setattr(shortage, "iterate", watched)
     limited = ALL.model_copy(update={"iterations": 2, "max_memory_bytes": 8 << 30})
     trained(scene, tmp_path / "whole", limited, kernels=kernels)
     assert kernels.forecast.most_pairs == most_pairs_of(24 << 30)
@@ -389,5 +387,5 @@ def test_density_control_starts_with_the_iterations_memory_freed(monkeypatch: py
         training.iteration = plan.schedule.density.first - 1
         before = weakref.ref(training.gaussians)
         monkeypatch.setattr(state.Adam, "select", watched)
-        shortage.iterate_within_memory(iterate, training, plan, photo, tiny_scene.Recorder())
+        shortage.iterate_within_memory(training, plan, photo, tiny_scene.Recorder())
     assert left == [None] and len(training.history.density) == 1

@@ -19,8 +19,8 @@ from rays import first_hits
 from repository import benchmark
 
 from splatpipe.demo import CAPTURE, capture_path
-from splatpipe.demo.scene import building_corners
-from splatpipe.demo.truth import Poses, centre, depth_map, true_poses, true_surface, truth_from_model
+from splatpipe.demo.site.scene import building_corners
+from splatpipe.demo.truth.truth import Poses, centre, depth_map, true_poses, true_surface, truth_from_model
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks, load_views
 from splatpipe.pipeline.raster.rasterizer import RenderOptions, render

@@ -11,8 +11,8 @@ import jinja2
 import numpy as np
 import pytest
 
-from splatpipe.pipeline.app.report import adjustment
-from splatpipe.pipeline.app.report.adjustment import adjustment_section
+from splatpipe.pipeline.app.report.chapters import adjustment
+from splatpipe.pipeline.app.report.chapters.adjustment import adjustment_section
 from splatpipe.pipeline.app.report.charts.adjustment_charts import strip_ends
 from splatpipe.pipeline.app.report.charts.drawing import styled
 from splatpipe.pipeline.app.report.facts.adjustment_results import adopted_focals_px, read_adjustment

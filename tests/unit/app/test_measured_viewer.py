@@ -10,8 +10,8 @@ import pytest
 from splatpipe.pipeline.app import measurements
 from splatpipe.pipeline.app.measured_viewer import update_viewer
 from splatpipe.pipeline.app.measurements import MEASURED, outdated, read_measurements, write_measurements
+from splatpipe.pipeline.app.report.chapters.surfaces import measures
 from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
-from splatpipe.pipeline.app.report.measures import measures
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.runs.store import Artifact, StageInputs, Store, open_store
 from splatpipe.pipeline.engine.stage import Stage

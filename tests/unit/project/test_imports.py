@@ -83,5 +83,5 @@ def test_every_name_imported_from_our_own_modules_exists() -> None:
 
 def test_a_missing_name_or_module_is_noticed() -> None:
     source = b"from .scene import build_scene, gone\nfrom . import house, lost\nfrom splatpipe.nowhere import a"
-    found = missing(ROOT / "demo" / "generate.py", source)
-    assert found == ["splatpipe.demo.scene.gone", "splatpipe.demo.lost", "splatpipe.nowhere"]
+    found = missing(ROOT / "demo" / "site" / "house.py", source)
+    assert found == ["splatpipe.demo.site.scene.gone", "splatpipe.demo.site.lost", "splatpipe.nowhere"]

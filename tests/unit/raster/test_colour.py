@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.colour import affine_colour
-from splatpipe.pipeline.raster.rasterizer import set_threads
 
 pytestmark = pytest.mark.usefixtures("isa")
 
@@ -36,7 +36,7 @@ def test_map_and_gradients_are_those_of_the_definition(size: tuple[int, int], st
 def test_any_number_of_threads_gives_the_same_bits() -> None:
     found = []
     for threads in (1, 2, 5):
-        set_threads(threads)
+        _native.set_threads(threads)
         found.append(gradients(211, 313, torch.float32))
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True) if a is not None and b is not None)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from splatpipe.pipeline.native import _native
-from splatpipe.pipeline.raster.rasterizer import set_threads
 from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes, laid_over_nodes_reference
 from splatpipe.pipeline.splat.sky.panorama import STEP_PX, nodes_along
 
@@ -79,7 +78,7 @@ def test_gradients_of_the_definition_are_those_of_finite_differences() -> None:
 def test_any_number_of_threads_gives_the_same_bits(kind: str) -> None:
     given, found = RandomPicture(211, 313, kind), []
     for threads in (1, 2, 5):
-        set_threads(threads)
+        _native.set_threads(threads)
         found.append(given.found())
     for other in found[1:]:
         assert all(torch.equal(one, two) for one, two in zip(found[0], other, strict=True))

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.native import _native
-from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render, set_threads
+from splatpipe.pipeline.raster.rasterizer import Render, RenderOptions, render
 from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
 # Tolerances of float32 against float64.
@@ -292,7 +292,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     camera = Camera("view", 230, 170, 180.0, 180.0, 115.0, 85.0, np.eye(4))
     outcomes = []
     for threads in (1, 2, 5):
-        set_threads(threads)
+        _native.set_threads(threads)
         outcomes.append(evaluate(scene, camera, RenderOptions(1, near=0.2)))
     assert outcomes[0].render.visible.sum() > 20_000
     assert same_bits(outcomes[0], outcomes[1])

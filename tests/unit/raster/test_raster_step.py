@@ -9,8 +9,10 @@ import torch
 from random_scene import random_camera, random_scene
 from torch import Tensor
 
+from splatpipe.pipeline.native import _native
+from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.optim import Adam, sh_rates
-from splatpipe.pipeline.raster.rasterizer import GradientBuffers, RenderOptions, render, set_threads
+from splatpipe.pipeline.raster.rasterizer import RenderOptions, render
 from splatpipe.pipeline.raster.step_lengths import FarSteps
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.techniques.dropout import _DropoutLogits
@@ -78,7 +80,7 @@ def test_left_out_rows_and_statistics_are_the_same(dropout: bool, magnitudes: bo
 def test_any_number_of_threads_gives_the_same_bits() -> None:
     start, found = spread_scene(5000, 3), []
     for threads in (1, 2, 5):
-        set_threads(threads)
+        _native.set_threads(threads)
         found.append(trained(start, True))
     assert all(torch.equal(one, other) for each in found[1:] for one, other in zip(found[0], each, strict=True))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatpipe.demo import capture_path
-from splatpipe.demo.geodesy import Origin as DemoOrigin
+from splatpipe.demo.photography.geodesy import Origin as DemoOrigin
 from splatpipe.pipeline.app.preflight.boundary import boundary_findings
 from splatpipe.pipeline.app.terminal.runs import overrides, with_boundary
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import Transformer
 
-from .mesh import Array
+from splatpipe.demo.site.mesh import Array
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from splatpipe.demo.parallel_view import ParallelView
-from splatpipe.demo.truth import Triangles
+from splatpipe.demo.photography.parallel_view import ParallelView
+from splatpipe.demo.truth.truth import Triangles
 
 Places = Float64[np.ndarray, "*n 3"]
 

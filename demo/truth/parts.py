@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float64, Int8
 
 from splatpipe.demo import CAPTURE
-from splatpipe.demo.house import BRICK, CREAM, NORTH_PLASTER, SHEET, SLATE, TILES
-from splatpipe.demo.scene import building_corners
-from splatpipe.demo.truth import Triangles
+from splatpipe.demo.site.house import BRICK, CREAM, NORTH_PLASTER, SHEET, SLATE, TILES
+from splatpipe.demo.site.scene import building_corners
+from splatpipe.demo.truth.truth import Triangles
 
 OTHER, GROUND, HOUSE, TILED, SLATED, SHEETED, PLAIN, BRICKS = range(8)
 NAMES = ("others", "ground", "house", "tiles", "slates", "metal roof", "plain walls", "bricks")

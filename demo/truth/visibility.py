@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from splatpipe.demo.depth_maps import load, true_cameras
-from splatpipe.demo.truth import Triangles, depth_map
+from splatpipe.demo.truth.depth_maps import load, true_cameras
+from splatpipe.demo.truth.truth import Triangles, depth_map
 from splatpipe.pipeline.geometry.camera import Camera
 
 BEHIND_M = 0.03  # tolerance by which a photo's depth may be less than a visible place's: less than half a pixel's slant
@@ -33,7 +33,7 @@ def true_views(surface: Triangles, folder: Path | None = None) -> list[TrueView]
 
     Args:
         surface: All triangles.
-        folder: Output of ``demo.depth_maps``; None to compute depths here, at half the size, in a CPU minute.
+        folder: Output of ``demo.truth.depth_maps``; None to compute depths here, at half the size, in a CPU minute.
     """
     if folder is not None:
         held = [load(path) for path in sorted(folder.glob("*.npz"))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .mesh import Array
+from splatpipe.demo.site.mesh import Array
 
 GAIN = 3.6  # radiance to sensor, at 0 EV
 WHITE_BALANCE = np.array([0.93, 1.0, 1.10])

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import BrownLens, Pose
-from .mesh import Array
-from .parallel_view import ParallelView
-from .scene import DemoScene
+from splatpipe.demo.photography.cameras import BrownLens, Pose
+from splatpipe.demo.photography.parallel_view import ParallelView
+from splatpipe.demo.site.mesh import Array
+from splatpipe.demo.site.scene import DemoScene
 
 SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG = 46.0, 222.0
 SUN_RADIUS_DEG = 0.2679

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE, add_house
-from .mesh import Array, Builder, Plane, TexturedMesh, paint_faces
-from .surroundings import add_surroundings
-from .textures import Painter, target
+from splatpipe.demo.site.house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE, add_house
+from splatpipe.demo.site.mesh import Array, Builder, Plane, TexturedMesh, paint_faces
+from splatpipe.demo.site.surroundings import add_surroundings
+from splatpipe.demo.site.textures import Painter, target
 
 SEED = 20261120
 PLOT_YAW_DEG = 17.0  # the house is rotated against north, as most houses are

@@ -12,7 +12,7 @@ from pathlib import Path
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from . import CAPTURE, capture_path
+from splatpipe.demo import CAPTURE, capture_path
 
 MAKE, MODEL = "DJI", "M3E"
 FOCAL_LENGTH_MM, FOCAL_LENGTH_35_MM = 12.29, 24

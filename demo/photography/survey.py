@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .cameras import BrownLens, Pose
-from .mesh import Array
-from .scene import SurveyTarget
+from splatpipe.demo.photography.cameras import BrownLens, Pose
+from splatpipe.demo.site.mesh import Array
+from splatpipe.demo.site.scene import SurveyTarget
 
 BORDER_PX = 12  # a target nearer to the photo's border is not marked
 MAX_INCIDENCE_DEG = 72

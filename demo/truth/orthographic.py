@@ -1,4 +1,4 @@
-"""True orthographic images of the scene: ``python -m splatpipe.demo.orthographic --out /tmp/demo-orthographic``.
+"""True orthographic images of the scene: ``python -m splatpipe.demo.truth.orthographic --out /tmp/demo-orthographic``.
 
 The house's plot from above and its four façades, by the renderer of the capture's photos: same light, same textures,
 no sensor noise, exposure 0 EV. The pixel size is half the photos' GSD, so that images on any grid can be made from
@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from .house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE
-from .mesh import Plane
-from .parallel_view import ParallelView
-from .scene import build_scene, turned
-from .sensor import GAIN, WHITE_BALANCE, coded
+from splatpipe.demo.photography.parallel_view import ParallelView
+from splatpipe.demo.photography.sensor import GAIN, WHITE_BALANCE, coded
+from splatpipe.demo.site.house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE
+from splatpipe.demo.site.mesh import Plane
+from splatpipe.demo.site.scene import build_scene, turned
 
 PIXEL_M = 0.014  # half of the photos' GSD
 TOP_HALF_M, TOP_HEIGHT_M = 18.0, 30.0  # half side and height of the top view; nothing in it is higher
@@ -71,7 +71,7 @@ def views(pixel_m: float = PIXEL_M) -> list[ParallelView]:
 
 
 def main() -> None:
-    from .render import Renderer  # takes mitsuba, which only rendering needs
+    from splatpipe.demo.photography.render import Renderer  # takes mitsuba, which only rendering needs
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for the pictures")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .mesh import Array
+from splatpipe.demo.site.mesh import Array
 
 
 @dataclass(frozen=True, eq=False)

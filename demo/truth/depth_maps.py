@@ -1,4 +1,4 @@
-"""Ground-truth depth maps of the capture's photos: ``python -m splatpipe.demo.depth_maps OUT [--noise]``.
+"""Ground-truth depth maps of the capture's photos: ``python -m splatpipe.demo.truth.depth_maps OUT [--noise]``.
 
 They serve to test surface reconstruction apart from depth estimation: the true depth along the ray of every pixel's
 centre, beside the photo of the pinhole camera. With ``--noise`` they have errors like measured ones. Each photo's
@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from PIL import Image
 
 from splatpipe.demo import capture_path
-from splatpipe.demo.cameras import BrownLens
-from splatpipe.demo.truth import depth_map, true_poses, true_surface
+from splatpipe.demo.photography.cameras import BrownLens
+from splatpipe.demo.truth.truth import depth_map, true_poses, true_surface
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.resampling import resample
 from splatpipe.pipeline.photos.pixels.undistortion import pinhole_camera

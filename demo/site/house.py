@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .mesh import WORLD, Builder, Plane
-from .textures import Painter, bricks, interior, mottled, painted, planks, plaster, roof_tiles, slabs
+from splatpipe.demo.site.mesh import WORLD, Builder, Plane
+from splatpipe.demo.site.textures import Painter, bricks, interior, mottled, painted, planks, plaster, roof_tiles, slabs
 
 HALF_LENGTH, HALF_WIDTH = 6.0, 4.5
 EAVES, RIDGE = 5.2, 8.8

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .textures import Image, Painter, TextureTile
+from splatpipe.demo.site.textures import Image, Painter, TextureTile
 
 Array = NDArray[np.float64]
 Numbers = Sequence[Any] | NDArray[Any] | float | int  # what np.asarray takes; ArrayLike is more than beartype can check

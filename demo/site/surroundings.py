@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from .mesh import WORLD, Array, Builder, Face, Plane, Superellipsoid
-from .textures import (
+from splatpipe.demo.site.mesh import WORLD, Array, Builder, Face, Plane, Superellipsoid
+from splatpipe.demo.site.textures import (
     Image,
     Painter,
     TextureTile,

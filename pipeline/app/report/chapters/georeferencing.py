@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from splatpipe.pipeline.app.report.adjustment import adjustment_section
+from splatpipe.pipeline.app.report.chapters.adjustment import adjustment_section
 from splatpipe.pipeline.app.report.facts.adjustment_results import read_adjustment
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.facts.wording import count, interval, length, metres, number

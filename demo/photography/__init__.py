@@ -1,0 +1,1 @@
+"""How it is photographed: flight and lens, path tracing, the sensor, metadata and the survey."""

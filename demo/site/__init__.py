@@ -1,0 +1,1 @@
+"""What is photographed: the house and its surroundings as textured faces."""

@@ -1,0 +1,1 @@
+"""What is true of it: poses, surface, depths, and what each photo sees."""
