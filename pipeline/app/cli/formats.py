@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from splatpipe.pipeline.app.library.commands import carry_out
+from splatpipe.pipeline.app.library.requests import existing_request, overrides
 from splatpipe.pipeline.app.terminal.parameters import (
     DeviceOption,
     JsonOption,
@@ -17,7 +19,6 @@ from splatpipe.pipeline.app.terminal.parameters import (
     WaitOption,
     expand_user,
 )
-from splatpipe.pipeline.app.terminal.runs import RunSession, existing_request, overrides
 from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
@@ -57,9 +58,7 @@ def export(
         done.notify_by(notify)
         tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
         check_possible(out, formats)
-        with RunSession(existing_request(out, tables, device, threads), wait) as runner:
-            done.outcome = runner.outcome
-            runner.walk()
+        carry_out(existing_request(out, tables, device, threads), done.watch, lambda runner: runner.walk(), wait=wait)
 
 
 def convert(

@@ -6,7 +6,7 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -15,6 +15,15 @@ from splatpipe.pipeline.app.cli.check import check
 from splatpipe.pipeline.app.cli.edit import OrderedCommand, edit
 from splatpipe.pipeline.app.cli.formats import convert, export
 from splatpipe.pipeline.app.cli.help import with_help
+from splatpipe.pipeline.app.library.commands import carry_out, run_line, run_one_stage
+from splatpipe.pipeline.app.library.requests import (
+    Overrides,
+    check_stage,
+    existing_request,
+    overrides,
+    request_of,
+    stages_to_rerun,
+)
 from splatpipe.pipeline.app.terminal.parameters import (
     BoundaryOption,
     ConfigOption,
@@ -44,19 +53,7 @@ from splatpipe.pipeline.app.terminal.parameters import (
     expand_user,
     stages,
 )
-from splatpipe.pipeline.app.terminal.runs import (
-    Overrides,
-    RunSession,
-    check_stage,
-    existing_request,
-    overrides,
-    print_forecast,
-    request_of,
-    stages_to_rerun,
-    status_as_json,
-    with_boundary,
-    with_budgets,
-)
+from splatpipe.pipeline.app.terminal.runs import status_as_json, with_boundary, with_budgets
 from splatpipe.pipeline.app.terminal.summary import CommandSummary, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
@@ -67,6 +64,9 @@ from splatpipe.pipeline.engine.errors import (
     exit_code,
 )
 from splatpipe.pipeline.engine.machine import available_cores
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.runs.runner import Runner
 
 app = typer.Typer(
     name="splatpipe",
@@ -119,7 +119,6 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Turn a folder of photos into a Gaussian splat; valid results of earlier runs are reused."""
-    from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
     from splatpipe.pipeline.engine.config import load_preset
 
     with CommandSummary(out, as_json) as done:
@@ -129,12 +128,7 @@ def run(
         resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
         again = stages_to_rerun(rerun or [], rerun_from, until)
         request = request_of(photos, out, resolved, device, threads)
-        require_readable(request)
-        require_memory(request, until)
-        print_forecast(request, until)
-        with RunSession(request, wait) as runner:
-            done.outcome = runner.outcome
-            runner.walk(until=until, rerun=again)
+        run_line(request, done.watch, until=until, rerun=again, wait=wait)
 
 
 @with_help(app)
@@ -178,11 +172,8 @@ def stage(
         check_stage(name)
         if shard is not None and assignments:
             raise UsageError("All shards of a stage have the same options.", hint="Omit either --set or --shard.")
-        done.writes_report = shard is None
         request = existing_request(out, overrides(None, assignments, None).tables, device, threads)
-        with RunSession(request, wait, "" if shard is None else f"{name}.{shard}") as runner:
-            done.outcome = runner.outcome
-            runner.run_alone(name) if shard is None else runner.run_shard(name, shard)
+        run_one_stage(name, request, done.watch, shard=shard, wait=wait)
 
 
 @with_help(app)
@@ -204,9 +195,7 @@ def georef(
         done.notify_by(notify)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
         tables = [*control, *overrides(None, assignments, None).tables]
-        with RunSession(existing_request(out, tables, device, threads), wait) as runner:
-            done.outcome = runner.outcome
-            runner.walk()
+        carry_out(existing_request(out, tables, device, threads), done.watch, lambda runner: runner.walk(), wait=wait)
 
 
 @with_help(app)
@@ -266,12 +255,14 @@ def surface(
         tables = [products_table, *overrides(None, assignments, None).tables]
         request = existing_request(out, tables, device, threads)
         check_possible(out, *tables)
-        with RunSession(request, wait) as runner:
-            done.outcome = runner.outcome
+
+        def make_and_measure(runner: Runner) -> None:
             runner.walk()
             if wanted.anything:
                 measured = measure_surface(out, wanted, threads or available_cores())
                 done.details, done.result_lines = {"surface": measured}, measurement_lines(out, measured)
+
+        carry_out(request, done.watch, make_and_measure, wait=wait)
 
 
 with_help(app)(export)
