@@ -21,7 +21,7 @@ SPENT_VARIABLE = "SPLATPIPE_SPENT_S"
 
 @dataclass(frozen=True)
 class Overrides:
-    """Configuration overrides from the command line."""
+    """Configuration overrides, as tables: later ones take precedence."""
 
     tables: Sequence[dict[str, Any]]
 

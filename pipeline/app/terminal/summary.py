@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.library.commands import Watch, interrupted_again
+from splatpipe.pipeline.app.library.user_errors import known_error
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, State, check_command, notify
 from splatpipe.pipeline.engine.errors import (
-    MachineError,
     SplatpipeError,
     StageError,
     StopSignal,
-    card_fault,
     exit_code,
 )
 
@@ -191,24 +190,10 @@ def print_json(value: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def _is_undecoded(error: UnicodeEncodeError) -> bool:
-    """Whether a text has bytes of a file's name that are not of the encoding of names."""
-    return any("\udc80" <= sign <= "\udcff" for sign in error.object[error.start : error.end])
-
-
 def for_the_user(error: Exception) -> SplatpipeError:
-    if isinstance(error, SplatpipeError):
-        return error
-    if isinstance(error, OSError):
-        return MachineError(str(error), "Check the free space and the permissions.")
-    if isinstance(error, UnicodeEncodeError) and (sys.getfilesystemencoding() != "utf-8" or _is_undecoded(error)):
-        return MachineError(
-            "A name of a file or folder has letters that this environment cannot write: its encoding is "
-            f"{sys.getfilesystemencoding()}.",
-            "Unset PYTHONUTF8, or set LC_ALL=C.UTF-8; or rename the file or folder.",
-        )
-    if (fault := card_fault(error)) is not None:
-        return fault
+    """The error to show; a bug is written to a file of its own, for a report."""
+    if (known := known_error(error)) is not None:
+        return known
     hint = "Please report it."
     with suppress(OSError):  # a container may have no writable folder for it
         with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:
