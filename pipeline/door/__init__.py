@@ -1,6 +1,7 @@
 """splatpipe as a library: from photos to a georeferenced splat, from scripts and notebooks (docs/library.md).
 
-The names below are public and stable; all modules are private. Nothing is loaded until it is used.
+The names in ``__all__`` are public and stable (docs/api.md); all modules are private. Nothing is loaded until it is
+used.
 
 This file is installed as ``splatpipe/__init__.py`` (pyproject.toml, ``tool.scikit-build.wheel.packages``).
 """

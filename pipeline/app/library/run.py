@@ -89,6 +89,8 @@ class Run:
         out: Its folder, absolute.
     """
 
+    out: Path
+
     def __init__(self, folder: RunFolder, device: str, threads: int) -> None:
         self.out = folder.out
         self._folder, self._device, self._threads = folder, device, threads

@@ -126,21 +126,21 @@ class Splat:
         """The splat in another frame, z up, harmonics included; its place is lost, and far coordinates get an origin.
 
         Args:
-            similarity: From its coordinates, ``means + origin``, to the new ones: as that of ``fit_similarity``.
+            similarity: From its coordinates, ``means + origin`` along its own axes, to new ones, z up: as that of
+                ``fit_similarity``.
 
         Raises:
             SplatpipeError: if the similarity is none.
         """
         import torch
 
-        there = replace(self, place=None, metres=False).turned("z up")
-        origin = np.array(there.origin)
-        centre = np.median(there.means, axis=0) if len(there) else np.zeros(3)
+        origin = np.array(self.origin)
+        centre = np.median(self.means, axis=0) if len(self) else np.zeros(3)
         middle = similarity.apply((origin + centre)[None])[0]
         new = np.rint(middle) if np.abs(middle).max() > FAR else np.zeros(3)
         shift = similarity.apply(origin[None])[0] - new
-        scene = _scene(there)
         rotation = torch.from_numpy(np.ascontiguousarray(similarity.rotation, np.float64))
+        scene = _scene(replace(self, place=None, metres=False, axes="z up"))
         try:
             moved = scene.gaussians.transformed(float(similarity.scale), rotation, torch.from_numpy(shift))
         except ValueError as error:
