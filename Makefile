@@ -5,6 +5,7 @@
 # make develop                 editable install: edited sources take effect at once; make test reverts to the wheel
 # make versions                brings stages/versions.toml up to date (SINCE=commit compares with that one)
 # make options-page            generates the tables of docs/options.md from the code
+# make api-page              writes the library's names and signatures to docs/api.md, as a decision
 # make rooms-page              generates the graphs and tables of docs/rooms.md and docs/stages.md from the contracts
 # make wheel                   makes wheels for other machines in dist/manylinux (PYTHONS=python3.13: for 3.12 and 3.13, too)
 # make release                 checks wheels and sdist in clean environments: licences, SBOM, types, the demo's bits
@@ -51,7 +52,7 @@ EITHER = $(if $(wildcard .venv/.developed),.venv/.developed,.venv/.installed)
 CUDA_WANTED = '$(SPLATPIPE_CUDA)' $(NVCC) $$([ "$(SPLATPIPE_CUDA)" != auto ] || \
   nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u)
 
-.PHONY: run test test-all aarch64 gpu-visit release sdist test-image test-docker test-cluster options-page rooms-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
+.PHONY: run test test-all aarch64 gpu-visit release sdist test-image test-docker test-cluster options-page api-page rooms-page test-captures test-isa sanitize symbols setup develop imports versions lint types layers wheel format clean FORCE
 .DEFAULT_GOAL := run
 
 run: $(EITHER)
@@ -154,6 +155,10 @@ versions: $(EITHER) .venv/.dev
 # The tables in docs/options.md, from the options' types, defaults and help.
 options-page: $(EITHER)
 	@$(BIN)/python tests/options_page.py
+
+# The public names and signatures in docs/api.md: whoever changes one, decides so.
+api-page: $(EITHER)
+	@$(BIN)/python tests/api_page.py
 
 # The graphs and tables in docs/rooms.md and docs/stages.md, from import-linter's contracts, the imports and the line.
 rooms-page: $(EITHER) .venv/.dev

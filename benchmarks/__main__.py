@@ -13,6 +13,7 @@ import ast
 import os
 import runpy
 import sys
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 
@@ -38,8 +39,17 @@ def main(words: list[str]) -> str | None:
     sys.path[:1] = paths  # in place of this folder
     os.environ["PYTHONPATH"] = os.pathsep.join([*paths, *filter(None, [os.environ.get("PYTHONPATH")])])
     sys.argv = [name, *arguments]
+    find_generator()
     runpy.run_path(str(scripts[name]), run_name="__main__")
     return None
+
+
+def find_generator() -> None:
+    """Let the generator of the demo capture be found, which no wheel contains."""
+    with suppress(ImportError):  # on a bare machine
+        import splatpipe.demo
+
+        splatpipe.demo.__path__.append(str(HOME.parent / "demo"))
 
 
 def runnable(path: Path) -> bool:

@@ -22,6 +22,7 @@ from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
 from timeouts import TIMEOUT_S
 
+import splatpipe.demo
 from splatpipe.pipeline.engine.heap import imports_outside_gc
 
 DEMO = (
@@ -38,6 +39,8 @@ DEMO = (
     "split.every=4",
 )
 WORKER = "PYTEST_XDIST_WORKER"  # set where tests run in several parallel processes
+
+splatpipe.demo.__path__.append(str(Path(__file__).parents[1] / "demo"))  # its generator, which no wheel contains
 
 
 def _modules_with_shapes() -> Iterator[str]:

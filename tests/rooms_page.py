@@ -70,7 +70,8 @@ def containers() -> dict[str, list[str]]:
     for contract in settings["tool"]["importlinter"]["contracts"]:
         if contract["type"] != "layers":
             continue
-        names = [name.strip(" ()") for layer in contract["layers"] for name in re.split(r"[|:]", layer)]
+        layers = [layer for layer in contract["layers"] if not layer.startswith("(")]  # an optional one is in no wheel
+        names = [name.strip() for layer in layers for name in re.split(r"[|:]", layer)]
         for container in contract.get("containers", ()):
             found.setdefault(container, []).extend(f"{container}.{name}" for name in names)
     return found

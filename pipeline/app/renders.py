@@ -12,11 +12,11 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 
+from splatpipe.pipeline.app.library.trained_scene import in_model_frame, scene_parts
 from splatpipe.pipeline.app.terminal.console import RunConsole
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.files.output_file import own_folder, write_file
-from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import FilmCamera, Route, cameras_along
 from splatpipe.pipeline.film.filming import (
@@ -40,12 +40,10 @@ from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.view_measures import flat_stems
 from splatpipe.pipeline.survey.crs.frames import load_frame
-from splatpipe.stages.line import CLEAN, EXPORT, FLYTHROUGH, LINE, TRAIN
 
 ORBIT_STILLS = 12
 FOLDER = "renders"  # below OUT
 OWN_PATHS = ("cameras", "orbit")
-READ = (*FLYTHROUGH.reads, "georef.frame")
 UP = np.array([0.0, 0.0, 1.0])  # in the world frame of `splat.ply`
 
 
@@ -171,15 +169,8 @@ class RenderTask:
 
     def _from_world(self, route: Route, lenses: Sequence[FilmCamera]) -> list[Camera]:
         """Convert a route in the world frame of `splat.ply` to cameras in the model frame."""
-        similarity = self.world_from_model
-        cameras = []
-        for camera in cameras_along(route, lenses, UP):
-            pose = np.eye(4)
-            pose[:3, :3] = camera.cam_from_world[:3, :3] @ similarity.rotation
-            offset = camera.cam_from_world[:3, :3] @ similarity.translation + camera.cam_from_world[:3, 3]
-            pose[:3, 3] = offset / similarity.scale
-            cameras.append(replace(camera, cam_from_world=pose))
-        return cameras
+        cameras = cameras_along(route, lenses, UP)
+        return [in_model_frame(camera, self.world_from_model) for camera in cameras]
 
 
 def render_run(out: Path, request: RenderRequest, threads: int, device: str = "auto") -> dict[str, Any]:
@@ -201,7 +192,7 @@ def render_run(out: Path, request: RenderRequest, threads: int, device: str = "a
     what, size = request.validate()
     chosen = choose_device(device)
     keyframes = None if request.path in OWN_PATHS else read_keyframes(_keyframe_file(request.path))
-    parts = _parts(out)
+    parts = scene_parts(out)
     target = request.target(out)
     console, began = RunConsole(), time.monotonic()
     console(Event("stage_started", "render", {"reason": f"{what} along {request.path}"}))
@@ -264,26 +255,3 @@ def _keyframe_file(path: str) -> Path:
     if not file.is_file():
         raise UsageError(f"There is no file {path[:200]}.", hint="--path takes cameras, orbit, or a keyframe file.")
     return file
-
-
-def _parts(out: Path) -> dict[str, Path]:
-    """The parts from which OUT's splat was made; those of the newest training if nothing was exported.
-
-    Raises:
-        UsageError: if training is not done.
-    """
-    found = {name: part.path for name, part in open_run_folder(out, LINE).lineage(EXPORT, CLEAN, TRAIN).items()}
-    if "train.model" in found:
-        found.setdefault("clean.model", found["train.model"])  # not cleaned yet, or by an older version
-    missing = [name for name in READ if name not in found]
-    if missing and "train.model" in found:
-        raise UsageError(
-            f"{out} was trained by an earlier version of splatpipe: {missing[0]} is missing.",
-            hint=f"Run it again with this version: splatpipe run PHOTOS {out}",
-        )
-    if missing:
-        raise UsageError(
-            f"{out} has no trained splat: {missing[0]} is missing.",
-            hint=f"Run the pipeline first: splatpipe run PHOTOS {out}",
-        )
-    return found

@@ -101,13 +101,38 @@ def parse_set(assignment: str, model: type[BaseModel]) -> Table:
         UsageError: if there is no ``=`` or no section.
     """
     dotted, equals, raw = assignment.partition("=")
-    keys = dotted.strip().split(".")
-    if not equals or len(keys) < 2 or not all(keys):
+    keys = _keys(dotted)
+    if not equals or not keys:
         raise UsageError(
             f'Cannot understand --set "{assignment}".',
             hint="Write it as --set SECTION.OPTION=VALUE, e.g. train.iterations=7000.",
         )
     return _nested(keys, raw.strip() if _takes_text(model, keys) else _parse_value(raw.strip()))
+
+
+def table_of(dotted: str, value: JSON) -> Table:
+    """Turn ``train.iterations`` and 7000 into ``{"train": {"iterations": 7000}}``.
+
+    Args:
+        dotted: The option's name.
+        value: Its value; a path counts as text.
+
+    Raises:
+        UsageError: if the name has no section.
+    """
+    keys = _keys(dotted)
+    if not keys:
+        raise UsageError(
+            f'Cannot understand the option "{dotted}".',
+            hint='Write it as "SECTION.OPTION": VALUE, e.g. "train.iterations": 7000.',
+        )
+    return _nested(keys, str(value) if isinstance(value, Path) else value)
+
+
+def _keys(dotted: str) -> list[str]:
+    """The parts of a dotted name; empty if it has no section."""
+    keys = dotted.strip().split(".")
+    return keys if len(keys) >= 2 and all(keys) else []
 
 
 def _takes_text(model: type[BaseModel], keys: Sequence[str]) -> bool:

@@ -70,6 +70,9 @@ class SimilarityFit:
         sigma_rotation_rad: Standard deviation of the rotation about its weakest axis; infinite where undetermined.
         used_prior: Whether the prior was needed for a rotation that the points leave free.
         offsets: The error that each group shares (target minus truth), in the target's units; empty without groups.
+        centre: The mean of the points that took part, in the source frame.
+        covariance: Of a rotation vector (radians), the log scale and a translation (target's units), about ``centre``;
+            zero for what is not determined.
     """
 
     similarity: Similarity
@@ -80,6 +83,17 @@ class SimilarityFit:
     sigma_rotation_rad: float
     used_prior: bool
     offsets: Float64[np.ndarray, "g 3"]
+    centre: Float64[np.ndarray, " 3"]
+    covariance: Float64[np.ndarray, "7 7"]
+
+    def sigmas_at(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Standard deviations of transformed points (target's units) from the fit's uncertainty, by its covariance.
+
+        Args:
+            points: In the source frame.
+        """
+        jacobian = similarity_jacobian(self.similarity, points, self.centre)
+        return np.asarray(np.sqrt(np.einsum("nkp,pq,nkq->nk", jacobian, self.covariance, jacobian)))
 
 
 def robust_similarity(
@@ -277,6 +291,8 @@ def _refine(
         sigma_rotation_rad=factor * sigma_rotation,
         used_prior=prior is not None,
         offsets=offsets,
+        centre=chosen.source.mean(axis=0),
+        covariance=factor**2 * _inverse(information),
     )
 
 
@@ -322,6 +338,13 @@ def _information(
         turned = cross_matrix(prior.source @ problem.similarity.rotation.T)
         information[:3, :3] += (np.swapaxes(turned, 1, 2) @ turned).sum(axis=0) / prior.sigma_rad**2
     return np.asarray(information)
+
+
+def _inverse(information: Float64[np.ndarray, "7 7"]) -> Float64[np.ndarray, "7 7"]:
+    """The covariance of a normal matrix, zero where undetermined; unknowns are scaled to equal size first."""
+    sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information / np.outer(sizes, sizes)
+    return np.asarray(np.linalg.pinv(scaled, rcond=RANK_TOLERANCE, hermitian=True) / np.outer(sizes, sizes))
 
 
 def _weakest_rotation(information: Float64[np.ndarray, "7 7"]) -> tuple[float, Float64[np.ndarray, " 3"]]:

@@ -21,10 +21,10 @@ from splatpipe.pipeline.app.batch.jobs.shards import (
     stage_job,
 )
 from splatpipe.pipeline.app.batch.jobs.workflow import GPU_STAGES
+from splatpipe.pipeline.app.library.requests import Overrides, request_of
 from splatpipe.pipeline.app.preflight.sizing import size_of
 from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
 from splatpipe.pipeline.app.report.facts.run_history import read_history
-from splatpipe.pipeline.app.terminal.runs import Overrides, request_of
 from splatpipe.pipeline.engine.config import Table, dump, load_preset, merge
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.files.durable import write_durably

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from splatpipe.pipeline.app.library.requests import check_stage, overrides, request_of
 from splatpipe.pipeline.app.terminal.parameters import (
     ConfigOption,
     JsonOption,
@@ -18,7 +19,6 @@ from splatpipe.pipeline.app.terminal.parameters import (
     SetOption,
     UntilOption,
 )
-from splatpipe.pipeline.app.terminal.runs import check_stage, overrides, request_of
 from splatpipe.pipeline.app.terminal.summary import print_json
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, exit_code
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from splatpipe.pipeline.app.library.requests import overrides
 from splatpipe.pipeline.app.terminal.parameters import (
     ConfigOption,
     JsonOption,
@@ -15,7 +16,6 @@ from splatpipe.pipeline.app.terminal.parameters import (
     SetOption,
     ThreadsOption,
 )
-from splatpipe.pipeline.app.terminal.runs import overrides
 from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, MachineError
 

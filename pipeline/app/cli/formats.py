@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from splatpipe.pipeline.app.library.commands import carry_out
+from splatpipe.pipeline.app.library.requests import existing_request, overrides
 from splatpipe.pipeline.app.terminal.parameters import (
     FormatOption,
     JsonOption,
@@ -16,7 +18,6 @@ from splatpipe.pipeline.app.terminal.parameters import (
     SetOption,
     expand_user,
 )
-from splatpipe.pipeline.app.terminal.runs import RunSession, existing_request, overrides
 from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
@@ -50,9 +51,8 @@ def export(
         done.notify_by(session.notify)
         tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
         check_possible(out, formats)
-        with RunSession(existing_request(out, tables, machine.device, machine.threads), session.wait) as runner:
-            done.outcome = runner.outcome
-            runner.walk()
+        request = existing_request(out, tables, machine.device, machine.threads)
+        carry_out(request, done.watch, lambda runner: runner.walk(), wait=session.wait)
 
 
 def convert(

@@ -6,7 +6,7 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -15,6 +15,15 @@ from splatpipe.pipeline.app.cli.check import check
 from splatpipe.pipeline.app.cli.edit import OrderedCommand, edit
 from splatpipe.pipeline.app.cli.formats import convert, export
 from splatpipe.pipeline.app.cli.help import with_help
+from splatpipe.pipeline.app.library.commands import carry_out, run_line, run_one_stage
+from splatpipe.pipeline.app.library.requests import (
+    Overrides,
+    check_stage,
+    existing_request,
+    overrides,
+    request_of,
+    stages_to_rerun,
+)
 from splatpipe.pipeline.app.terminal.parameters import (
     BoundaryOption,
     ConfigOption,
@@ -42,19 +51,7 @@ from splatpipe.pipeline.app.terminal.parameters import (
     expand_user,
     stages,
 )
-from splatpipe.pipeline.app.terminal.runs import (
-    Overrides,
-    RunSession,
-    check_stage,
-    existing_request,
-    overrides,
-    print_forecast,
-    request_of,
-    stages_to_rerun,
-    status_as_json,
-    with_boundary,
-    with_budgets,
-)
+from splatpipe.pipeline.app.terminal.runs import status_as_json, with_boundary, with_budgets
 from splatpipe.pipeline.app.terminal.summary import CommandSummary, for_the_user, print_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
@@ -65,6 +62,9 @@ from splatpipe.pipeline.engine.errors import (
     exit_code,
 )
 from splatpipe.pipeline.engine.machine import available_cores
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.runs.runner import Runner
 
 app = typer.Typer(
     name="splatpipe",
@@ -115,7 +115,6 @@ def run(
     session: SessionOptions,
 ) -> None:
     """Turn a folder of photos into a Gaussian splat; valid results of earlier runs are reused."""
-    from splatpipe.pipeline.app.preflight.start import require_memory, require_readable
     from splatpipe.pipeline.engine.config import load_preset
 
     with CommandSummary(out, session.as_json) as done:
@@ -125,12 +124,7 @@ def run(
         resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
         again = stages_to_rerun(rerun or [], rerun_from, until)
         request = request_of(photos, out, resolved, machine.device, machine.threads)
-        require_readable(request)
-        require_memory(request, until)
-        print_forecast(request, until)
-        with RunSession(request, session.wait) as runner:
-            done.outcome = runner.outcome
-            runner.walk(until=until, rerun=again)
+        run_line(request, done.watch, until=until, rerun=again, wait=session.wait)
 
 
 @with_help(app)
@@ -168,11 +162,8 @@ def stage(
         check_stage(name)
         if shard is not None and assignments:
             raise UsageError("All shards of a stage have the same options.", hint="Omit either --set or --shard.")
-        done.writes_report = shard is None
         request = existing_request(out, overrides(None, assignments, None).tables, machine.device, machine.threads)
-        with RunSession(request, session.wait, "" if shard is None else f"{name}.{shard}") as runner:
-            done.outcome = runner.outcome
-            runner.run_alone(name) if shard is None else runner.run_shard(name, shard)
+        run_one_stage(name, request, done.watch, shard=shard, wait=session.wait)
 
 
 @with_help(app)
@@ -192,9 +183,8 @@ def georef(
         done.notify_by(session.notify)
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
         tables = [*control, *overrides(None, assignments, None).tables]
-        with RunSession(existing_request(out, tables, machine.device, machine.threads), session.wait) as runner:
-            done.outcome = runner.outcome
-            runner.walk()
+        request = existing_request(out, tables, machine.device, machine.threads)
+        carry_out(request, done.watch, lambda runner: runner.walk(), wait=session.wait)
 
 
 @with_help(app)
@@ -252,12 +242,14 @@ def surface(
         tables = [products_table, *overrides(None, assignments, None).tables]
         request = existing_request(out, tables, machine.device, machine.threads)
         check_possible(out, *tables)
-        with RunSession(request, session.wait) as runner:
-            done.outcome = runner.outcome
+
+        def make_and_measure(runner: Runner) -> None:
             runner.walk()
             if wanted.anything:
                 measured = measure_surface(out, wanted, machine.threads or available_cores())
                 done.details, done.result_lines = {"surface": measured}, measurement_lines(out, measured)
+
+        carry_out(request, done.watch, make_and_measure, wait=session.wait)
 
 
 with_help(app)(export)

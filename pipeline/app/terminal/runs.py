@@ -1,56 +1,12 @@
-"""Preparation of a pipeline command: resolved options, the request, an open session."""
+"""What the command line adds to a run: abbreviated options, and statuses as JSON."""
 
 from __future__ import annotations
 
-import os
-import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
-
-from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.machine import available_cores
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runs.line import StageStatus
-    from splatpipe.pipeline.engine.runs.runner import Runner
-    from splatpipe.pipeline.engine.runs.session import Request
-    from splatpipe.stages.options import LineConfig
-
-SPENT_VARIABLE = "SPLATPIPE_SPENT_S"
-
-
-@dataclass(frozen=True)
-class Overrides:
-    """Configuration overrides from the command line."""
-
-    tables: Sequence[dict[str, Any]]
-
-    def resolve(self, *below: dict[str, Any]) -> LineConfig:
-        from splatpipe.pipeline.engine.config import merge, resolve
-        from splatpipe.stages.options import LineConfig
-        from splatpipe.stages.products import NO_PRODUCTS, PRODUCTS_FROM_BUDGET_S
-
-        train = merge(self.tables).get("train")
-        budget = train.get("time_budget_s") if isinstance(train, dict) else None
-        if budget:
-            below = (*below, {"train": {"max_megapixels": 0.0}})  # a preset's image size fits its own length
-            if isinstance(budget, int | float) and budget < PRODUCTS_FROM_BUDGET_S:
-                below = (*below, NO_PRODUCTS)
-        return resolve(LineConfig, [*below, *self.tables])
-
-
-def overrides(config: Path | None, assignments: Sequence[str] | None, seed: int | None) -> Overrides:
-    from splatpipe.pipeline.engine.config import load_file, parse_set, with_seed
-    from splatpipe.stages.options import LineConfig
-
-    tables = [load_file(config)] if config else []
-    for table in tables:  # OUT/config.toml contains these two besides the options
-        table.pop("photos", None), table.pop("splatpipe", None)
-    if seed is not None:
-        tables.append(with_seed(LineConfig, seed))
-    return Overrides([*tables, *(parse_set(text, LineConfig) for text in assignments or ())])
 
 
 def with_budgets(assignments: Sequence[str] | None, time_budget: str | None, max_memory: str | None) -> list[str]:
@@ -70,82 +26,6 @@ def with_boundary(assignments: Sequence[str] | None, boundary: str | None) -> li
     return [*([] if boundary is None else [f"georef.boundary={boundary}"]), *(assignments or ())]
 
 
-def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto", threads: int = 0) -> Request:
-    from splatpipe.pipeline.app.preflight.start import memory_limit
-    from splatpipe.pipeline.engine.runs.session import Request
-    from splatpipe.pipeline.engine.runs.source import with_absolute_files
-    from splatpipe.pipeline.engine.stage import Machine
-    from splatpipe.stages.forecast.needs import Forecaster
-    from splatpipe.stages.line import LINE
-
-    began_s = round(time.monotonic() - spent_s(), 3)
-    if device not in ("auto", "cpu", "cuda"):
-        raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
-    if device == "cuda":  # reported now, not when training begins; `auto` falls back to the CPU if CUDA does not work
-        from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
-
-        if unfit := config.train.unfit_for_cuda():
-            raise UsageError(unfit, hint="Omit --device, or give --device cpu.")
-        if missing := unavailable_reason():
-            raise missing.error()
-    if os.environ.get("SPLATPIPE_ISA"):  # an invalid one is reported now, not when training begins
-        import splatpipe.pipeline.raster.isa  # noqa: F401
-    machine = Machine(device, threads or available_cores(), began_s, memory_limit(config, device))
-    forecast_needs = Forecaster(config, machine.threads)
-    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, forecast_needs)
-
-
-def spent_s() -> float:
-    """Seconds that earlier commands spent on the same capture, which count towards a time budget."""
-    try:
-        return max(0.0, float(os.environ.get(SPENT_VARIABLE, "0")))
-    except ValueError:
-        return 0.0
-
-
-def print_forecast(request: Request, until: str | None) -> None:
-    """Print the forecast for the whole pipeline, before its first training, and whether memory may not suffice."""
-    from splatpipe.pipeline.app.preflight.start import forecast_text, shortage_text
-    from splatpipe.pipeline.app.terminal.console import print_line
-    from splatpipe.pipeline.app.terminal.summary import PART_VARIABLE
-
-    trained = any((request.out / "stages").glob("train-*"))
-    if trained or PART_VARIABLE in os.environ:
-        return
-    for text in (forecast_text(request) if until is None else "", shortage_text(request, until)):
-        if text:
-            print_line(text)
-
-
-def existing_request(
-    out: Path, tables: Sequence[dict[str, Any]] = (), device: str = "auto", threads: int = 0
-) -> Request:
-    """The request that runs OUT again with the given overrides."""
-    from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
-    from splatpipe.stages.line import LINE
-    from splatpipe.stages.options import LineConfig
-
-    photos, config = open_run_folder(out, LINE).config(LineConfig, *tables)
-    return request_of(photos, out, config, device, threads)
-
-
-def check_stage(name: str) -> None:
-    from splatpipe.stages.line import LINE
-
-    names = [entry.name for entry in LINE]
-    if name not in names:
-        raise UsageError(f'There is no stage "{name}".', hint=f"The stages are: {', '.join(names)}.")
-
-
-def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | None) -> frozenset[str]:
-    from splatpipe.stages.line import LINE
-
-    for name in [*rerun, *filter(None, (rerun_from, until))]:
-        check_stage(name)
-    names = [entry.name for entry in LINE]
-    return frozenset([*rerun, *(names[names.index(rerun_from) :] if rerun_from else [])])
-
-
 def status_as_json(status: StageStatus) -> dict[str, Any]:
     """The status of a stage and of its shards, for ``status --json``."""
     from splatpipe.pipeline.engine.runs.needs import used_and_forecast
@@ -160,39 +40,3 @@ def status_as_json(status: StageStatus) -> dict[str, Any]:
         **(used_and_forecast(artifact.manifest) if artifact else {}),
         **({"shards": [status_as_json(shard) for shard in status.shards]} if status.shards else {}),
     }
-
-
-class RunSession:
-    """An open session whose events go to the terminal; the terminal is restored even after an error."""
-
-    def __init__(self, request: Request, wait: bool = False, shard: str = "") -> None:
-        self._request, self._wait, self._shard = request, wait, shard
-
-    def __enter__(self) -> Runner:
-        from splatpipe.pipeline.app.terminal.console import RunConsole
-        from splatpipe.pipeline.engine.runs.session import open_session
-
-        self._console = RunConsole()
-        self._session = open_session(self._request, self._console, wait=self._wait, shard=self._shard)
-        return self._session.__enter__()
-
-    def __exit__(self, *error: Any) -> bool | None:
-        self._console.close()
-        try:
-            if not self._shard:
-                self._update_viewer()
-        finally:
-            stopped = self._session.__exit__(*error)
-        return stopped
-
-    def _update_viewer(self) -> None:
-        """Update the measurements in the viewer while OUT is locked; problems are only reported."""
-        from splatpipe.pipeline.app.measured_viewer import update_viewer
-        from splatpipe.pipeline.app.terminal.console import print_line
-
-        try:
-            trouble = update_viewer(self._request.out)
-        except (OSError, SplatpipeError) as error:
-            trouble = f"viewer.html could not be updated: {error}"
-        if trouble:
-            print_line(trouble)

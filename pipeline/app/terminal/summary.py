@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 import time
@@ -13,39 +12,70 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatpipe.pipeline.app.library.commands import Watch, interrupted_again
+from splatpipe.pipeline.app.library.user_errors import known_error
 from splatpipe.pipeline.app.notice import TIME_LIMIT_S, State, check_command, notify
 from splatpipe.pipeline.engine.errors import (
-    MachineError,
     SplatpipeError,
     StageError,
     StopSignal,
-    card_fault,
     exit_code,
 )
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.verdict import Verdict
+    from splatpipe.pipeline.app.terminal.console import RunConsole
+    from splatpipe.pipeline.engine.events import Event
     from splatpipe.pipeline.engine.runs.runner import Outcome
 
-PART_VARIABLE = "SPLATPIPE_PART"  # set if further commands run more stages at once: success needs no report yet
-STOP_S = 4.0  # after Ctrl-C the report is limited to this: the command promises to end within five seconds
-
-NOTICE_S = 4.7  # and the notification gets what is left of this,
+# After Ctrl-C the notification gets what the report leaves of this: the command promises to end within five seconds,
+NOTICE_S = 4.7
 MIN_NOTICE_S = 0.5  # but at least this
 
 
-class CommandSummary:
-    """Reports the success or failure of a command: a summary on stderr, one JSON object for programs."""
+class TerminalWatch(Watch):
+    """Shows a command's events and messages on the terminal."""
 
-    outcome: Outcome | None = None
-    writes_report: bool = True  # false for a single shard: others may be running in OUT, and the report covers them all
+    def __init__(self) -> None:
+        super().__init__()
+        self._console: RunConsole | None = None
+
+    def event(self, event: Event) -> None:
+        """Show an event: a progress bar, or a line."""
+        from splatpipe.pipeline.app.terminal.console import RunConsole
+
+        if self._console is None:
+            self._console = RunConsole()
+        self._console(event)
+
+    def message(self, text: str) -> None:
+        """Print a line."""
+        from splatpipe.pipeline.app.terminal.console import print_line
+
+        print_line(text)
+
+    def pause(self) -> None:
+        """Remove the progress bar, so that further output starts on its own line."""
+        if self._console is not None:
+            self._console.close()
+
+
+class CommandSummary:
+    """Reports the success or failure of a command: a summary on stderr, one JSON object for programs.
+
+    Attributes:
+        watch: Shows the command's progress on the terminal, and has what came of it.
+        details: Further entries of the JSON object.
+        result_lines: Results of the command, one line each.
+    """
+
     details: Mapping[str, Any] | None = None
     result_lines: Sequence[str] = ()
-    _report_path: Path | None = None
     _command: str | None = None
 
     def __init__(self, out: Path, as_json: bool) -> None:
         self._out, self._as_json = out, as_json
+        self.watch = TerminalWatch()
         self._started_s = time.monotonic()
 
     def __enter__(self) -> CommandSummary:
@@ -65,14 +95,11 @@ class CommandSummary:
         seconds = time.monotonic() - self._started_s
         if isinstance(error, GeneratorExit | SystemExit):
             return
-        step = error is None and PART_VARIABLE in os.environ
-        if self.outcome is not None and self.writes_report and not step and not _interrupted_again(error):
-            self._report(error)
-        if error is None and self.outcome is not None:
-            self._show(self.outcome, seconds)
+        if error is None and self.watch.outcome is not None:
+            self._show(self.watch.outcome, seconds)
         if self._as_json:
             print_json({**self._as_object(error, seconds), **(self.details or {})})
-        if self._command is not None and not _interrupted_again(error):
+        if self._command is not None and not interrupted_again(error):
             self._notify(self._command, error)
 
     def _notify(self, command: str, error: BaseException | None) -> None:
@@ -84,25 +111,10 @@ class CommandSummary:
         if isinstance(error, StopSignal | KeyboardInterrupt):
             state = "stopped"
             limit_s = max(MIN_NOTICE_S, getattr(error, "at_s", time.monotonic()) + NOTICE_S - time.monotonic())
-        out = self._out.resolve()
-        trouble = notify(command, state, out.name, self._report_path and self._report_path.resolve(), out, limit_s)
+        out, report = self._out.resolve(), self.watch.report
+        trouble = notify(command, state, out.name, report and report.resolve(), out, limit_s)
         if trouble:
             print_line(trouble)
-
-    def _report(self, error: BaseException | None) -> None:
-        """Write the report, unless it is there and no stage ran; its problems do not affect the run."""
-        from splatpipe.pipeline.app.report import REPORT_FILE, is_current, make_report
-        from splatpipe.pipeline.app.terminal.console import print_line
-        from splatpipe.pipeline.engine.runs.run_folder import LOG_FILE
-
-        if error is None and self.outcome is not None and not self.outcome.ran and is_current(self._out):
-            self._report_path = self._out / REPORT_FILE
-            return
-        until_s = error.at_s + STOP_S if isinstance(error, StopSignal) else None
-        try:
-            self._report_path = make_report(self._out, self._out / LOG_FILE, until_s=until_s)
-        except SplatpipeError as trouble:
-            print_line(f"{trouble.message} {trouble.hint}".strip())
 
     def _show(self, outcome: Outcome, seconds: float) -> None:
         from splatpipe.pipeline.app.terminal.console import show_accuracy, show_bad_cameras, show_outputs, show_verdict
@@ -120,10 +132,10 @@ class CommandSummary:
 
         made = [(stage, outcome.artifacts[stage.name]) for stage in LINE if stage.name in outcome.artifacts]
         files = [self._out / name for stage, artifact in made for name in artifact.deliverables(stage)]
-        return [path for path in [*files, *filter(None, [self._report_path])] if path.is_file()]
+        return [path for path in [*files, *filter(None, [self.watch.report])] if path.is_file()]
 
     def _as_object(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
-        outcome = self.outcome
+        outcome = self.watch.outcome
         artifacts = outcome.artifacts if outcome else {}
         return {
             "out": str(self._out),
@@ -142,14 +154,6 @@ class CommandSummary:
             "failed": outcome.failed if outcome else "",
             "outputs": [str(path) for path in self._files(outcome)] if outcome else [],
         }
-
-
-def _interrupted_again(error: BaseException | None) -> bool:
-    """Whether the user pressed Ctrl-C again during the shutdown: then nothing is waited for."""
-    before = None if error is None else error.__context__
-    while before is not None and not isinstance(before, StopSignal):
-        before = before.__context__
-    return isinstance(error, StopSignal) and before is not None
 
 
 def _accuracy(outcome: Outcome) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -186,24 +190,10 @@ def print_json(value: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def _is_undecoded(error: UnicodeEncodeError) -> bool:
-    """Whether a text has bytes of a file's name that are not of the encoding of names."""
-    return any("\udc80" <= sign <= "\udcff" for sign in error.object[error.start : error.end])
-
-
 def for_the_user(error: Exception) -> SplatpipeError:
-    if isinstance(error, SplatpipeError):
-        return error
-    if isinstance(error, OSError):
-        return MachineError(str(error), "Check the free space and the permissions.")
-    if isinstance(error, UnicodeEncodeError) and (sys.getfilesystemencoding() != "utf-8" or _is_undecoded(error)):
-        return MachineError(
-            "A name of a file or folder has letters that this environment cannot write: its encoding is "
-            f"{sys.getfilesystemencoding()}.",
-            "Unset PYTHONUTF8, or set LC_ALL=C.UTF-8; or rename the file or folder.",
-        )
-    if (fault := card_fault(error)) is not None:
-        return fault
+    """The error to show; a bug is written to a file of its own, for a report."""
+    if (known := known_error(error)) is not None:
+        return known
     hint = "Please report it."
     with suppress(OSError):  # a container may have no writable folder for it
         with tempfile.NamedTemporaryFile("w", prefix="splatpipe-", suffix=".log", delete=False) as file:

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -30,7 +32,10 @@ from splatpipe.pipeline.surface.drawings.drawing import (
     Drawing,
     Stroke,
 )
-from splatpipe.pipeline.surface.drawings.dxf import DxfDocument, TextEntityAlignment, new_document, reproducible
+from splatpipe.pipeline.surface.drawings.dxf import alignment, new_document
+
+if TYPE_CHECKING:
+    from ezdxf.document import Drawing as DxfDocument
 
 DXF_VERSION = "R2000"  # the oldest with drawing units and images, so most programs read it
 METRES = 6  # value of $INSUNITS
@@ -50,11 +55,7 @@ LAYERS = {
     SURFACE: (7, 35, "#000000"),
     TEXTS: (7, 18, "#000000"),
 }
-ANCHORS = {
-    "start": TextEntityAlignment.LEFT,
-    "middle": TextEntityAlignment.CENTER,
-    "end": TextEntityAlignment.RIGHT,
-}
+ANCHORS: Mapping[str, Literal["LEFT", "CENTER", "RIGHT"]] = {"start": "LEFT", "middle": "CENTER", "end": "RIGHT"}
 
 
 def write_dxf_drawing(path: Path, drawing: Drawing) -> None:
@@ -64,8 +65,7 @@ def write_dxf_drawing(path: Path, drawing: Drawing) -> None:
         OSError: if the disk is full or not writable.
     """
     mm = drawing.scale / 1000.0
-    with reproducible():
-        document = new_document(DXF_VERSION, units=METRES)
+    with new_document(DXF_VERSION, METRES) as document:
         document.header["$MEASUREMENT"] = 1
         for name in sorted(_layers_of(drawing)):
             colour, weight, _ = LAYERS[name]
@@ -83,7 +83,7 @@ def write_dxf_drawing(path: Path, drawing: Drawing) -> None:
                 model.add_point(place, dxfattribs={"layer": drawing.dots.layer})
         for label in drawing.labels:
             text = model.add_text(label.text, height=label.size_mm * mm, dxfattribs={"layer": TEXTS})
-            text.set_placement((label.right_m, label.up_m), align=ANCHORS[label.anchor])
+            text.set_placement((label.right_m, label.up_m), align=alignment(ANCHORS[label.anchor]))
         low, high = drawing.box()
         model.reset_extents((*low.tolist(), 0.0), (*high.tolist(), 0.0))
         with whole_file(path) as aside:

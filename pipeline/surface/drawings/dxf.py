@@ -2,7 +2,8 @@
 
 When it is imported, ezdxf reads configuration files of the home folder and of the current folder, searches the system
 for fonts and stores what it found in the home folder. Our files must depend on none of these, and an arbitrary user in
-a container has no home folder, without which the import fails.
+a container has no home folder, without which the import fails. Its environment variables are the only way to tell it,
+so it is imported when the first drawing is made, and not before: nobody's environment changes by an import of ours.
 """
 
 from __future__ import annotations
@@ -11,12 +12,53 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal
 
 from splatpipe.pipeline.engine.files.output_file import write_file
 
+if TYPE_CHECKING:
+    from ezdxf.document import Drawing as DxfDocument
+    from ezdxf.enums import TextEntityAlignment
+
 FOLDERS = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")  # variables of where it reads and writes
 NO_FONTS = '{"version": 2, "font-faces": []}'  # ezdxf's font cache: with another version, it would search for fonts
+
+
+@contextmanager
+def new_document(version: str, units: int) -> Iterator[DxfDocument]:
+    """Yield a new document; what is made of it in the context has neither dates nor random numbers.
+
+    Args:
+        version: AutoCAD's, as ``R2000``.
+        units: Value of ``$INSUNITS``.
+    """
+    ezdxf = _ezdxf()
+    before = ezdxf.options.write_fixed_meta_data_for_testing
+    ezdxf.options.write_fixed_meta_data_for_testing = True
+    try:
+        yield ezdxf.new(version, units=units)
+    finally:
+        ezdxf.options.write_fixed_meta_data_for_testing = before
+
+
+def alignment(name: Literal["LEFT", "CENTER", "RIGHT"]) -> TextEntityAlignment:
+    """How a text lies at its place."""
+    _ezdxf()
+    from ezdxf.enums import TextEntityAlignment
+
+    return TextEntityAlignment[name]
+
+
+@cache
+def _ezdxf() -> ModuleType:
+    """The library, imported with an empty home folder and set back to its defaults."""
+    with _empty_home():
+        import ezdxf
+    ezdxf.options.reset()  # type: ignore[attr-defined, no-untyped-call]  # drops what the folder says
+    return ezdxf
 
 
 @contextmanager
@@ -35,24 +77,3 @@ def _empty_home() -> Iterator[None]:
                     del os.environ[name]
                 else:
                     os.environ[name] = value
-
-
-with _empty_home():
-    from ezdxf._options import options
-    from ezdxf.document import Drawing as DxfDocument
-    from ezdxf.enums import TextEntityAlignment
-    from ezdxf.filemanagement import new as new_document
-options.reset()  # type: ignore[no-untyped-call]  # drops what the current folder's file says
-
-__all__ = ["DxfDocument", "TextEntityAlignment", "new_document", "reproducible"]
-
-
-@contextmanager
-def reproducible() -> Iterator[None]:
-    """Make ezdxf write neither dates nor random numbers, by its own options."""
-    before = options.write_fixed_meta_data_for_testing
-    options.write_fixed_meta_data_for_testing = True
-    try:
-        yield
-    finally:
-        options.write_fixed_meta_data_for_testing = before

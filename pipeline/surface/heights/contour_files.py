@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.engine.files.output_file import new_file
-from splatpipe.pipeline.surface.drawings.dxf import new_document, reproducible
+from splatpipe.pipeline.surface.drawings.dxf import new_document
 from splatpipe.pipeline.surface.heights.contours import Contours
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, unit_name
@@ -71,8 +71,7 @@ def write_dxf(path: Path, contours: Contours, crs: MapCrs) -> None:
         contours: In the CRS.
         crs: CRS of the contours.
     """
-    with reproducible():
-        drawing = new_document(DXF_VERSION, units=DXF_UNITS.get(unit_name(crs.unit_m), 0))
+    with new_document(DXF_VERSION, DXF_UNITS.get(unit_name(crs.unit_m), 0)) as drawing:
         drawing.header["$MEASUREMENT"] = 1
         about = f"every {contours.interval:g}, {crs.described_heights()}; {crs.horizontal.name}"
         for name in (LAYER, INDEX_LAYER):

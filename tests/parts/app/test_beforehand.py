@@ -8,8 +8,8 @@ import pytest
 from command import splatpipe
 
 from splatpipe.demo import capture_path
+from splatpipe.pipeline.app.library.requests import overrides, request_of
 from splatpipe.pipeline.app.preflight.start import COMMAND_BYTES, forecast_text, require_memory, shortage_text
-from splatpipe.pipeline.app.terminal.runs import overrides, request_of
 from splatpipe.pipeline.engine import machine
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.pipeline.engine.errors import MachineError

@@ -12,11 +12,11 @@ from command import splatpipe
 from PIL import ExifTags, Image, ImageFilter
 
 from splatpipe.demo import capture_path
+from splatpipe.pipeline.app.library.requests import overrides
 from splatpipe.pipeline.app.preflight.examination import examine_capture
 from splatpipe.pipeline.app.preflight.findings import Finding, Preflight, as_json
 from splatpipe.pipeline.app.preflight.intake import read_capture
 from splatpipe.pipeline.app.preflight.places import control_findings
-from splatpipe.pipeline.app.terminal.runs import overrides
 from splatpipe.pipeline.engine.config import load_preset
 from splatpipe.pipeline.engine.events import EventReporter
 from splatpipe.pipeline.engine.runs.source import open_source

@@ -144,6 +144,14 @@ def test_options_lists_every_option(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "train.iterations" in done.stdout
 
 
+def test_the_library_is_imported_without_anything_heavy() -> None:
+    code = (
+        "import sys; before = set(sys.modules); import splatpipe; splatpipe.SplatpipeError; splatpipe.__version__\n"
+        "print(sorted({name.split('.')[0] for name in set(sys.modules) - before} - set(sys.stdlib_module_names)))"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "['splatpipe']"
+
+
 def test_the_package_is_a_namespace_of_its_own() -> None:
     code = (
         "import splatpipe.pipeline, splatpipe.stages, splatpipe.demo\n"

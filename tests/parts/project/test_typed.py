@@ -20,13 +20,18 @@ import splatpipe
 from splatpipe.pipeline.engine import quantities
 from splatpipe.pipeline.engine.errors import UsageError
 
+run: splatpipe.Run = splatpipe.open_run("out")
+size: int = len(splatpipe.read_splat("splat.ply"))
+version: str = splatpipe.__version__
 error: Exception = UsageError("What is wrong.", hint="What helps.")
 length: float = quantities.parse_length("2cm", "--gsd")
 """
 BAD = """
+import splatpipe
 from splatpipe.pipeline.engine.quantities import parse_length
 
 length: str = parse_length("2cm", "--gsd")
+run: str = splatpipe.open_run("out")
 """
 
 
@@ -58,6 +63,7 @@ def test_a_users_mypy_finds_splatpipe_and_its_modules(user_python: Path, tmp_pat
 def test_a_users_mypy_notices_a_wrong_use(user_python: Path, tmp_path: Path) -> None:
     done = mypy(user_python, tmp_path, BAD)
     assert 'expression has type "float", variable has type "str"' in done.stdout
+    assert 'expression has type "Run", variable has type "str"' in done.stdout
 
 
 def test_the_namespace_itself_can_be_checked(user_python: Path) -> None:

@@ -18,7 +18,7 @@ from splatpipe.pipeline.app.batch.monitor import BatchMonitor
 from splatpipe.pipeline.app.batch.pages.publication import COLUMNS, table_text
 from splatpipe.pipeline.app.batch.pages.state import BatchState, CaptureState
 from splatpipe.pipeline.app.batch.planning import Settings, make_plan
-from splatpipe.pipeline.app.terminal.runs import SPENT_VARIABLE, spent_s
+from splatpipe.pipeline.app.library.requests import SPENT_VARIABLE, spent_s
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_MACHINE, EXIT_STAGE, UsageError
 from splatpipe.stages.line import LINE
 

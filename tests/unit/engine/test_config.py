@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatpipe.pipeline.app.terminal.runs import overrides, with_budgets
+from splatpipe.pipeline.app.library.requests import overrides
+from splatpipe.pipeline.app.terminal.runs import with_budgets
 from splatpipe.pipeline.engine.config import (
     current_options,
     dump,

@@ -8,6 +8,7 @@ from pathlib import Path
 from repository import ROOT
 
 IMPORTING = ("demo", "benchmarks", "tests")
+DOOR = ROOT / "pipeline" / "door" / "__init__.py"  # of splatpipe itself
 PATHS = (
     "tests",
     "tests/scenes",
@@ -22,7 +23,7 @@ def file_of(module: str, importer: Path) -> Path | None:
     """Return the source of one of our modules, as imported by a given file; None for third-party modules."""
     parts = module.split(".")
     if parts[0] == "splatpipe":
-        stems = [ROOT.joinpath(*parts[1:])]
+        stems = [ROOT.joinpath(*parts[1:])] if len(parts) > 1 else [DOOR.parent]
     else:
         stems = [folder.joinpath(*parts) for folder in (importer.parent, *(ROOT / each for each in PATHS))]
     found = [path for stem in stems for path in (*map(stem.with_suffix, (".py", ".pyi")), stem / "__init__.py")]
@@ -47,7 +48,7 @@ def names_of(path: Path) -> frozenset[str]:
     """Return the names that can be imported from one of our sources."""
     names = set(bound(ast.parse(path.read_bytes()).body))
     if path.name == "__init__.py":
-        names |= {each.stem for each in path.parent.iterdir()}
+        names |= {each.stem for each in (ROOT if path == DOOR else path.parent).iterdir()}
     return frozenset(names)
 
 

@@ -10,8 +10,9 @@ import pytest
 
 from splatpipe.demo import capture_path
 from splatpipe.demo.photography.geodesy import Origin as DemoOrigin
+from splatpipe.pipeline.app.library.requests import overrides
 from splatpipe.pipeline.app.preflight.boundary import boundary_findings
-from splatpipe.pipeline.app.terminal.runs import overrides, with_boundary
+from splatpipe.pipeline.app.terminal.runs import with_boundary
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector

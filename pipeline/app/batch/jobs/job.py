@@ -30,9 +30,9 @@ from splatpipe.pipeline.app.batch.jobs.attempts import (
 )
 from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, PlannedCapture, StageJob, workflow_jobs
 from splatpipe.pipeline.app.batch.jobs.shards import counts_shards, store_shard_jobs
+from splatpipe.pipeline.app.library.commands import PART_VARIABLE
+from splatpipe.pipeline.app.library.requests import SPENT_VARIABLE
 from splatpipe.pipeline.app.report.facts.run_history import read_history
-from splatpipe.pipeline.app.terminal.runs import SPENT_VARIABLE
-from splatpipe.pipeline.app.terminal.summary import PART_VARIABLE
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
 from splatpipe.pipeline.engine.files.output_file import appended_file, write_file
 from splatpipe.pipeline.engine.python_module import python_module

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from splatpipe.pipeline.app.batch.jobs.plan import Call, StageJob
-from splatpipe.pipeline.app.terminal.runs import existing_request
+from splatpipe.pipeline.app.library.requests import existing_request
 from splatpipe.pipeline.engine.runs.line import StageStatus, line_status
 from splatpipe.pipeline.engine.runs.needs import Need, of_shard
 from splatpipe.pipeline.engine.runs.session import status_of

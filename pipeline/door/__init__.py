@@ -1,0 +1,87 @@
+"""splatpipe as a library: from photos to a georeferenced splat, from scripts and notebooks (docs/library.md).
+
+The names in ``__all__`` are public and stable (docs/api.md); all modules are private. Nothing is loaded until it is
+used.
+
+This file is installed as ``splatpipe/__init__.py`` (pyproject.toml, ``tool.scikit-build.wheel.packages``).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from splatpipe.pipeline.app.library.captures import run_capture, run_stage
+    from splatpipe.pipeline.app.library.fits import fit_similarity
+    from splatpipe.pipeline.app.library.run import Render, Run, SparsePoints, look_at, open_run
+    from splatpipe.pipeline.app.library.splats import Splat, read_splat, write_splat
+    from splatpipe.pipeline.engine.errors import SplatpipeError
+    from splatpipe.pipeline.engine.events import Event
+    from splatpipe.pipeline.geometry.alignment import SimilarityFit
+    from splatpipe.pipeline.geometry.camera import Camera
+    from splatpipe.pipeline.geometry.similarity import Similarity
+    from splatpipe.pipeline.splat.model.scene import SplatOrigin
+
+    __version__: str
+
+_MODULES = {
+    "Camera": "geometry.camera",
+    "Event": "engine.events",
+    "Render": "app.library.run",
+    "Run": "app.library.run",
+    "Similarity": "geometry.similarity",
+    "SimilarityFit": "geometry.alignment",
+    "SparsePoints": "app.library.run",
+    "Splat": "app.library.splats",
+    "SplatOrigin": "splat.model.scene",
+    "SplatpipeError": "engine.errors",
+    "fit_similarity": "app.library.fits",
+    "look_at": "app.library.run",
+    "open_run": "app.library.run",
+    "read_splat": "app.library.splats",
+    "run_capture": "app.library.captures",
+    "run_stage": "app.library.captures",
+    "write_splat": "app.library.splats",
+}
+"""The module below ``splatpipe.pipeline`` that defines each public name."""
+
+__all__ = [
+    "Camera",
+    "Event",
+    "Render",
+    "Run",
+    "Similarity",
+    "SimilarityFit",
+    "SparsePoints",
+    "Splat",
+    "SplatOrigin",
+    "SplatpipeError",
+    "__version__",
+    "fit_similarity",
+    "look_at",
+    "open_run",
+    "read_splat",
+    "run_capture",
+    "run_stage",
+    "write_splat",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first used."""
+    import importlib
+
+    if name == "__version__":
+        import importlib.metadata
+
+        value: Any = importlib.metadata.version("splatpipe")
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(f"splatpipe.pipeline.{_MODULES[name]}"), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__
