@@ -94,6 +94,7 @@ def kernels_name(device: torch.device) -> str:
 def free_frames() -> None:
     """Free the memory that the CPU kernels keep for later renders; the next render allocates it again."""
     _native.free_frames()
+    _native.free_feature_frames()
 
 
 def set_threads(threads: int) -> None:
