@@ -264,5 +264,5 @@ def _conics(projected: Projected) -> Tensor:
 def _warn_of_reference() -> None:
     warnings.warn(
         "rasterization has native kernels for the CPU only: on other devices the slow torch reference renders.",
-        stacklevel=3,
+        stacklevel=4,  # the caller of rasterization
     )
