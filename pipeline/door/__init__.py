@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.geometry.alignment import SimilarityFit
     from splatpipe.pipeline.geometry.camera import Camera
     from splatpipe.pipeline.geometry.similarity import Similarity
+    from splatpipe.pipeline.raster.fused_adam import FusedAdam
+    from splatpipe.pipeline.raster.fused_ssim import fused_ssim
+    from splatpipe.pipeline.raster.rasterization import rasterization
     from splatpipe.pipeline.splat.model.scene import SplatOrigin
 
     __version__: str
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "Camera": "geometry.camera",
     "Event": "engine.events",
+    "FusedAdam": "raster.fused_adam",
     "Render": "app.library.run",
     "Run": "app.library.run",
     "Similarity": "geometry.similarity",
@@ -36,8 +40,10 @@ _MODULES = {
     "SplatOrigin": "splat.model.scene",
     "SplatpipeError": "engine.errors",
     "fit_similarity": "app.library.fits",
+    "fused_ssim": "raster.fused_ssim",
     "look_at": "app.library.run",
     "open_run": "app.library.run",
+    "rasterization": "raster.rasterization",
     "read_splat": "app.library.splats",
     "run_capture": "app.library.captures",
     "run_stage": "app.library.captures",
@@ -48,6 +54,7 @@ _MODULES = {
 __all__ = [
     "Camera",
     "Event",
+    "FusedAdam",
     "Render",
     "Run",
     "Similarity",
@@ -58,8 +65,10 @@ __all__ = [
     "SplatpipeError",
     "__version__",
     "fit_similarity",
+    "fused_ssim",
     "look_at",
     "open_run",
+    "rasterization",
     "read_splat",
     "run_capture",
     "run_stage",

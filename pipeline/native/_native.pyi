@@ -118,6 +118,111 @@ class Frame:
 def free_frames() -> None:
     """Free the memory kept for later renders."""
 
+def project_activated(
+    gaussians: Sequence[Tensor],
+    camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
+    options: tuple[float, ...],
+    outputs: Sequence[Tensor | None],
+) -> None:
+    """Project activated Gaussians to one view.
+
+    Args:
+        gaussians: means (n, 3), quats (n, 4), scales (n, 3), opacities (n,); float32.
+        camera: cam_from_world (4, 4) float64; centre of projection; width, height; fx, fy, cx, cy in pixels.
+        options: near, far, blur in px², plane sigmas, floor of the compensations' squares, clipped radius.
+        outputs: Written: means2d (n, 2), depths (n,), covariances (n, 3), determinants (n,); compensations (n,) and
+            slants (n, 2), or None each; radii (n, 2) int32. Zeros where not visible.
+
+    Raises:
+        ValueError: if shapes do not match.
+    """
+
+def project_activated_backward(
+    gaussians: Sequence[Tensor],
+    camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
+    options: tuple[float, ...],
+    radii: Tensor,
+    gradients: Sequence[Tensor | None],
+    outputs: Sequence[Tensor],
+) -> None:
+    """Add the gradients of means, quats and scales to `outputs`.
+
+    Args:
+        gaussians: As in the projection, as are the camera and the options.
+        camera: See above.
+        options: See above.
+        radii: Of the projection.
+        gradients: Of means2d, depths, covariances, compensations and slants; None for zero.
+        outputs: Those of the gradients of means (n, 3), quats (n, 4) and scales (n, 3).
+
+    Raises:
+        ValueError: if shapes do not match.
+    """
+
+def sh_colours(
+    means: Tensor,
+    sh: Tensor,
+    radii: Tensor,
+    camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
+    degree: int,
+    colours: Tensor,
+) -> None:
+    """Colours (n, 3) of sh (n, k, 3) from a view, clamped at 0; zeros where radii are. Writes `colours`."""
+
+def sh_colours_backward(
+    means: Tensor,
+    sh: Tensor,
+    radii: Tensor,
+    camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
+    degree: int,
+    gradients: Tensor,
+    by_means: Tensor,
+    by_sh: Tensor,
+) -> None:
+    """Add the gradients by means and coefficients to the last two arguments, from those of the colours."""
+
+class FeatureFrame:
+    """A view's blended features and the data for the backward pass; its memory is reused by later ones.
+
+    `splats`: means2d (n, 2), depths (n,), covariances (n, 3), determinants (n,), opacities (n,), features (n, d);
+    slants (n, 2) or None; radii (n, 2) int32.
+    """
+
+    def __init__(self) -> None: ...
+    def forward(
+        self,
+        splats: Sequence[Tensor | None],
+        size: tuple[int, int],
+        alpha_max: float,
+        background: Tensor | None,
+        outputs: tuple[Tensor, Tensor],
+    ) -> None:
+        """Blend; writes the images (h, w, d) and alpha (h, w). The background is (d,), or None for zeros.
+
+        Raises:
+            TooManyPairs, MemoryError: if the splats cover too much.
+            ValueError: if shapes do not match.
+        """
+
+    def backward(
+        self,
+        splats: Sequence[Tensor | None],
+        gradients: Sequence[Tensor | None],
+        outputs: Sequence[Tensor | None],
+    ) -> None:
+        """Add gradients to `outputs`, from those of the images and alpha (None for zero).
+
+        Args:
+            splats: Those of the last forward().
+            gradients: Of the images and of alpha.
+            outputs: Gradients of means2d, covariances, opacities, features and slants, and the sums of each pixel's
+                absolute gradient by means2d (n, 2); None for the last where not wanted, and for slants without any.
+
+        Raises:
+            MemoryError: if there is not enough.
+            ValueError: if shapes do not match, or forward() rendered something else.
+        """
+
 def photo_loss(
     render: Tensor,
     photo: Tensor,

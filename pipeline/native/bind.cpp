@@ -13,6 +13,7 @@ namespace nb = nanobind;
 using namespace nb::literals;
 
 void bind_raster(nb::module_& m);
+void bind_features(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_adam(nb::module_& m);
 void bind_patch_match(nb::module_& m);
@@ -44,6 +45,7 @@ NB_MODULE(_native, m) {
     m.def("set_isa", &set_isa, "name"_a, "Use one of isas(), or \"auto\".");
     splat::set_isa("auto");
     bind_raster(m);
+    bind_features(m);
     bind_loss(m);
     bind_adam(m);
     bind_patch_match(m);

@@ -141,7 +141,7 @@ class _Rasterize(torch.autograd.Function):
                 None if part is None else (part.left, part.top, part.whole_width, part.whole_height),
             )
         except (_native.TooManyPairs, MemoryError) as error:
-            _refuse(error, n)
+            refuse(error, n)
         visible = visible.view(torch.bool)
         depth_sum, depth_square_sum, median_depth = depths or (torch.zeros(()).expand(h, w),) * 3
         ctx.set_materialize_grads(False)
@@ -172,7 +172,7 @@ class _Rasterize(torch.autograd.Function):
         try:
             ctx.frame.blend_backward(pictures, ctx.magnitudes)
         except MemoryError as error:
-            _refuse(error, len(parameters[0]))
+            refuse(error, len(parameters[0]))
         if ctx.buffers is not None and can_wait(wanted[1:], ctx.leaves, ctx.probe):
             is_leaf = ctx.leaves[_LOGITS]
             gain = None if is_leaf else torch.ones_like(parameters[_LOGITS])
@@ -193,7 +193,12 @@ def _project_backward(
     return gradients, means2d
 
 
-def _refuse(error: Exception, gaussians: int) -> NoReturn:
+def refuse(error: Exception, gaussians: int) -> NoReturn:
+    """Say in words why a render of so many Gaussians does not fit.
+
+    Raises:
+        SplatpipeError: always.
+    """
     if isinstance(error, MemoryError):
         raise MachineError(
             f"Not enough memory to rasterize {gaussians} Gaussians.",

@@ -14,6 +14,7 @@
 #include <type_traits>
 #include <vector>
 
+#include "raster/features_cpu.h"
 #include "raster/raster_cpu.h"
 #include "raster/view.h"
 
@@ -238,7 +239,13 @@ class Frame {
 
 void bind_raster(nb::module_& m) {
     nb::exception<splat::TooManyPairs>(m, "TooManyPairs", PyExc_OverflowError);
-    m.def("free_frames", &splat::free_frames, "Gives back the memory that is kept for renders to come.");
+    m.def(
+        "free_frames",
+        [] {
+            splat::free_frames();
+            splat::free_feature_frames();
+        },
+        "Gives back the memory that is kept for renders to come.");
     nb::class_<Frame>(m, "Frame")
         .def(nb::init<>())
         .def("forward", &Frame::forward, nb::arg("parameters").noconvert(), nb::arg("camera").noconvert(), "options"_a,

@@ -1,73 +1,16 @@
 // The CPU rasterizer's driver: scheduling of the kernels, and ownership of memory. Not for kernel files.
 #pragma once
 
-#include <cstddef>
 #include <cstdint>
-#include <cstdlib>
 #include <memory>
-#include <new>
-#include <stdexcept>
 #include <vector>
 
-#if defined(__linux__)
-#include <sys/mman.h>
-#endif
-
 #include "adam/adam_step.h"
+#include "raster/buffer.h"
 #include "raster/raster.h"
-
-#if defined(__SANITIZE_ADDRESS__)
-#include <sanitizer/asan_interface.h>
-#endif
+#include "raster/tile_lists.h"
 
 namespace splat {
-
-// More Gaussian-tile pairs than 32-bit indices allow.
-struct TooManyPairs : std::runtime_error {
-    TooManyPairs() : std::runtime_error("the Gaussians cover more tiles than 32-bit indices hold") {}
-};
-
-// Uninitialized memory that only grows, so that a training loop does not fault in fresh pages at every iteration.
-template <class T>
-class Buffer {
-  public:
-    Buffer() = default;
-    Buffer(const Buffer&) = delete;
-    Buffer& operator=(const Buffer&) = delete;
-    ~Buffer() { std::free(data_); }
-
-    // Room for at least `count` elements; the content is lost if it grows. Throws std::bad_alloc.
-    T* reserve(int64_t count) {
-        if (count > capacity_) grow(count);
-#if defined(__SANITIZE_ADDRESS__)  // to detect accesses beyond the requested size too
-        ASAN_UNPOISON_MEMORY_REGION(data_, static_cast<std::size_t>(count) * sizeof(T));
-        ASAN_POISON_MEMORY_REGION(data_ + count, static_cast<std::size_t>(capacity_ - count) * sizeof(T));
-#endif
-        return data_;
-    }
-    T* data() const { return data_; }
-
-  private:
-    static constexpr std::size_t kLine = 64, kHugePage = 2 << 20;  // bytes
-
-    void grow(int64_t count) {
-        std::free(data_);
-        data_ = nullptr, capacity_ = 0;
-        const int64_t wanted = count + count / 4;  // densification grows a scene step by step
-        const std::size_t bytes = static_cast<std::size_t>(wanted) * sizeof(T);
-        const std::size_t unit = bytes < kHugePage ? kLine : kHugePage, size = (bytes + unit - 1) / unit * unit;
-        data_ = static_cast<T*>(std::aligned_alloc(unit, size));
-        if (!data_) throw std::bad_alloc();
-#if defined(__linux__)  // splats and slots are accessed in random order: with 4 KiB pages most accesses would miss the
-                        // TLB
-        if (unit == kHugePage) madvise(data_, size, MADV_HUGEPAGE);
-#endif
-        capacity_ = static_cast<int64_t>(size / sizeof(T));
-    }
-
-    T* data_ = nullptr;
-    int64_t capacity_ = 0;
-};
 
 // Positions farther than `unit` from `centre` are stepped farther, as step_lengths.py says.
 struct FarSteps {
@@ -103,43 +46,24 @@ class RasterFrame {
     // skipped for their gradients.
     int64_t step(const Parameters& in, const FrameStep& step);
 
-    int64_t pairs() const { return pairs_; }
-    int64_t visible() const { return visible_; }
+    int64_t pairs() const { return lists_.pairs(); }
+    int64_t visible() const { return lists_.visible(); }
 
     // Number of pixel-splat pairs blended in the last forward() call. For benchmarks: slow.
     int64_t contributions() const;
 
   private:
-    // Per kCandidatesATask candidates; after the prefix sum, where their shares begin.
-    struct TaskCounts {
-        int64_t visible, rows, pairs;
-    };
-
     void find_candidates(const Parameters& in, float* radii, uint8_t* visible);
-    void project(const Parameters& in, float* radii, uint8_t* visible);
-    void find_tiles();
-    void sort_by_depth();
-    void bin();
-    void prefix_tiles(int chunks, int tiles);
 
     const ProjectKernels* project_ = nullptr;  // of the last forward(), whose layout the other calls use
     const BlendKernels* blend_ = nullptr;
     View view_{};
     FrameData data_{};
     bool magnitudes_ = false;  // of the last blend_backward()
-    int64_t candidates_ = 0, visible_ = 0, rows_ = 0, pairs_ = 0;
-    const int32_t* order_ = nullptr;  // visible candidates by depth
+    int64_t candidates_ = 0;
+    TileLists lists_;
     Buffer<int64_t> found_counts_;
     Buffer<int32_t> found_rows_, candidate_rows_;
-    Buffer<Splat> splats_;
-    Buffer<TaskCounts> tasks_;
-    Buffer<Touched> touched_;
-    Buffer<Span> spans_;
-    Buffer<uint32_t> keys_, sort_keys_;  // two halves, of the visible ones
-    Buffer<int32_t> sort_order_;         // two halves
-    Buffer<int32_t> cursors_;            // (chunks, tiles), and of the sort's buckets
-    Buffer<int64_t> tile_begin_;
-    Buffer<int32_t> pair_splat_, pair_slot_;
     Buffer<uint8_t> pair_blocks_;
     Buffer<float> slots_, transmittance_;
     Buffer<int32_t> pixel_end_;
