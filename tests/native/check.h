@@ -59,6 +59,7 @@ constexpr int kThreadCounts[] = {1, 2, 5};
 void test_threads();
 void test_raster();
 void test_gradients();
+void test_features();
 void test_loss();
 void test_colour();
 void test_sky();

@@ -49,6 +49,7 @@ int main() {
     test_threads();
     test_raster();
     test_gradients();
+    test_features();
     test_loss();
     test_colour();
     test_sky();
