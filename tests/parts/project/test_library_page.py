@@ -27,7 +27,6 @@ from splatpipe.stages.options import LineConfig
 PAGE = ROOT / "docs" / "library.md"
 EXAMPLE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMENT = re.compile(rb"^comment .*\n", re.MULTILINE)
-PENDING = ("rasterization",)  # public names that are not there yet: their examples are only compiled
 
 
 def examples() -> dict[str, str]:
@@ -84,11 +83,9 @@ def run_example(title: str, folder: Path) -> str:
 def test_the_page_has_six_examples_with_public_names_only() -> None:
     assert len(examples()) == 6
     used = {name for text in examples().values() for name in names_used(text)}
-    assert used <= {*splatpipe.__all__, *PENDING}
-    assert not set(PENDING) & set(splatpipe.__all__), "it is there: let its example run"
+    assert used <= set(splatpipe.__all__)
 
 
-@pytest.mark.skipif("rasterization" in PENDING, reason="the name is not there yet")
 def test_a_toy_scene_is_trained(folder: Path) -> None:
     losses = [float(line.split()[1]) for line in run_example("Train a toy scene", folder).splitlines()]
     assert len(losses) == 5 and losses[-1] < 0.5 * losses[0]
