@@ -225,7 +225,9 @@ def _degrees(value: Any, reference: Any, signs: Mapping[str, float]) -> tuple[fl
     cut = any(abs(size - round(size)) > WHOLE and any(sizes[at + 1 :]) for at, size in enumerate(sizes))
     if cut or any(size > SIXTY for size in sizes[1:]):
         return math.nan, True
-    degrees = sum(size / 60.0**power for power, size in enumerate(sizes))
+    degrees = 0.0
+    for power, size in enumerate(sizes):  # not sum(), which gives other bits since Python 3.12
+        degrees += size / 60.0**power
     degrees = -degrees if any(number is not None and number < 0.0 for number in numbers) else degrees
     word = _text(reference).upper()
     if not word:
