@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatpipe.pipeline.app.batch.jobs.attempts import Attempt, as_engine_knows, read_attempts
-from splatpipe.pipeline.app.batch.jobs.engine_errors import read_errors
+from splatpipe.pipeline.app.batch.jobs.job_errors import read_errors
 from splatpipe.pipeline.app.batch.jobs.plan import BATCH_FOLDER, Call, PlannedCapture, StageJob, workflow_jobs
 from splatpipe.pipeline.app.batch.jobs.slurm_queue import read_queue
 from splatpipe.pipeline.app.batch.pages.pictures import capture_picture

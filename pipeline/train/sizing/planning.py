@@ -21,8 +21,8 @@ from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of
 from splatpipe.pipeline.train.plan.start import InitialGaussians, started
 from splatpipe.pipeline.train.plan.windows import TrainingSize
 from splatpipe.pipeline.train.sizing.measure import MachineSpeed, MeasuringBudget, TimedScene, measure
+from splatpipe.pipeline.train.sizing.memory_limit import within_memory
 from splatpipe.pipeline.train.sizing.shortage import HINT
-from splatpipe.pipeline.train.state.memory import within_memory
 
 MEASURE_SHARE = 0.05  # share of the budget spent on measuring at most
 MEASURE_SECONDS = 10.0  # spent on measuring at most: by then the noise of a shared machine is averaged out

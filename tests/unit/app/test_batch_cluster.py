@@ -20,7 +20,7 @@ from splatpipe.pipeline.app.batch.jobs import job as job_module
 from splatpipe.pipeline.app.batch.jobs import slurm_queue as slurm
 from splatpipe.pipeline.app.batch.jobs import snakemake_process
 from splatpipe.pipeline.app.batch.jobs.attempts import AttemptLog, AttemptResult
-from splatpipe.pipeline.app.batch.jobs.engine_errors import ERRORS_FILE, ErrorRecorder, read_errors
+from splatpipe.pipeline.app.batch.jobs.job_errors import ERRORS_FILE, ErrorRecorder, read_errors
 from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, StageJob, workflow_jobs
 from splatpipe.pipeline.app.batch.jobs.shards import CLUSTER_BYTES, NOTHING, stage_job, useful_threads
 from splatpipe.pipeline.app.batch.jobs.snakemake_process import Profile, open_profile, require_snakemake

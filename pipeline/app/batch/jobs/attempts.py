@@ -1,4 +1,4 @@
-"""What became of each attempt of a job (finished, failed, cancelled, killed): their log and the engine's word."""
+"""What became of each attempt of a job, from its log and from what `job_errors` recorded of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.jobs.engine_errors import EngineError
+from splatpipe.pipeline.app.batch.jobs.job_errors import EngineError
 from splatpipe.pipeline.engine.errors import EXIT_INPUT, EXIT_STAGE, EXIT_USAGE
 from splatpipe.pipeline.engine.files.output_file import appended_file
 from splatpipe.pipeline.engine.files.small_file import read_small

@@ -23,8 +23,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatpipe.pipeline.app.batch.jobs.engine_errors import record_errors
 from splatpipe.pipeline.app.batch.jobs.job import end_with_parent
+from splatpipe.pipeline.app.batch.jobs.job_errors import record_errors
 from splatpipe.pipeline.app.batch.jobs.plan import MEGABYTE, BatchPlan, Call
 from splatpipe.pipeline.app.batch.jobs.slurm_queue import largest_node
 from splatpipe.pipeline.app.batch.jobs.workflow import SNAKEFILE

@@ -1,6 +1,7 @@
-"""Errors of jobs as Snakemake and the engine below it (Slurm, Kubernetes) report them, one JSON object per line.
+"""How jobs of a batch ended (cancelled, preempted, out of memory or time), as Snakemake and its executor report it.
 
-Snakemake's own process records them: only it learns that a job died before it began, or was ended from outside.
+The executor is Slurm or Kubernetes. Snakemake's own process records one JSON object per line: only it learns that a job
+died before it began, or was ended from outside.
 """
 
 from __future__ import annotations
