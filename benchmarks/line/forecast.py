@@ -4,6 +4,7 @@ python benchmarks forecast                       # the table of figures that is 
 python benchmarks forecast --add OUT NAME PRESET # reads a run's manifests (at least to `sparse`) into that table
     --stage sparse --speed 0.5                      # … of one stage only; its machine was half as fast as the reference
 python benchmarks forecast --costs               # prints the fitted costs, for stages/forecast/costs.py
+python benchmarks forecast --hours               # prints the table of hours of docs/speed.md
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from tables import print_table
 
 from splatpipe.pipeline.engine.config import load_preset, resolve
 from splatpipe.stages.forecast.costs import REFERENCE, Costs
+from splatpipe.stages.forecast.needs import RunForecast
+from splatpipe.stages.forecast.training import CaptureSize
 from splatpipe.stages.options import LineConfig
 
 TABLE = Path(__file__).with_name("forecast.json")
@@ -28,6 +31,7 @@ FITTED_TO = "preview"  # runs of other presets are reported, not fitted
 MEMORY_WITHIN = 0.3
 CPU_WITHIN = 1.5
 ROUNDING = 0.01  # relative rounding error of the costs in `stages/forecast/costs.py`, which have three digits
+PHOTOS, CORES, MEGAPIXELS = (100, 300, 500), (2, 8, 32), 20.0  # of the table of hours
 DISPLAYED_STAGES = ("features", "matches", "sparse", "initialize", "train")
 
 
@@ -40,7 +44,11 @@ def main() -> int:
         "--speed", type=float, default=1.0, help="of the run's machine: CPU seconds are multiplied by it"
     )
     parser.add_argument("--costs", action="store_true")
+    parser.add_argument("--hours", action="store_true", help="print the table of docs/speed.md")
     options = parser.parse_args()
+    if options.hours:
+        sys.stdout.write(hours_table())
+        return 0
     rows = json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.is_file() else []
     if options.add:
         out, name, preset = options.add
@@ -67,6 +75,22 @@ def main() -> int:
         title = "other presets, against the costs in stages/forecast/costs.py"
         show(title, others, [compared(run, REFERENCE) for run in others])
     return 0
+
+
+def hours_table() -> str:
+    """The forecast hours of whole runs on the reference machine's cores, as a table in Markdown."""
+    columns = [(preset, threads) for preset in ("preview", "standard", "high") for threads in CORES]
+    lines = ["photos", *(f"{preset}, {threads} cores" for preset, threads in columns)]
+    text = f"| {' | '.join(lines)} |\n{'|---' * len(lines)}|\n"
+    for photos in PHOTOS:
+        size = CaptureSize(photos, MEGAPIXELS, positions=True)
+        cells = []
+        for preset, threads in columns:
+            needs = RunForecast.of(size, configured(preset), threads).needs(speed=1.0)
+            minutes = sum(need.seconds(threads) for need in needs.values()) / 60.0
+            cells.append(f"{minutes:.0f} min" if minutes < 60.0 else f"{minutes / 60.0:.1f} h")
+        text += f"| {photos} | {' | '.join(cells)} |\n"
+    return text
 
 
 def costs_text(costs: Costs) -> str:
