@@ -14,6 +14,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.raster.autograd import refuse
 from splatpipe.pipeline.raster.feature_definitions import BlendOptions, Projected, ProjectionOptions, Steps, View
 from splatpipe.pipeline.raster.isa import _native
@@ -51,10 +52,11 @@ class _Project(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         gaussians = tuple(leaf.detach().contiguous() for leaf in leaves)
         v, n = len(views), gaussians[0].shape[1]
-        means2d, depths, determinants = torch.empty(v, n, 2), torch.empty(v, n), torch.empty(v, n)
-        covariances, radii = torch.empty(v, n, 3), torch.empty(v, n, 2, dtype=torch.int32)
-        compensations = torch.empty(v, n) if options.compensate else None
-        slants = torch.empty(v, n, 2) if options.slants else None
+        new = gaussians[0].new_empty  # torch's default dtype and device may be others
+        means2d, depths, determinants = new(v, n, 2), new(v, n), new(v, n)
+        covariances, radii = new(v, n, 3), new(v, n, 2, dtype=torch.int32)
+        compensations = new(v, n) if options.compensate else None
+        slants = new(v, n, 2) if options.slants else None
         fields = (means2d, depths, covariances, determinants, compensations, slants, radii)
         for index, view in enumerate(views):
             scene = tuple(each[index * len(each) // v] for each in gaussians)
@@ -122,7 +124,7 @@ class _ShColours(torch.autograd.Function):
         ctx: Any, views: tuple[NativeView, ...], degree: int, radii: Tensor, means: Tensor, sh: Tensor
     ) -> Tensor:
         means, sh = means.detach().contiguous(), sh.detach().contiguous()
-        colours = torch.empty(len(views), means.shape[1], 3)
+        colours = means.new_empty(len(views), means.shape[1], 3)
         for index, view in enumerate(views):
             mine = (means[index * len(means) // len(views)], sh[index * len(sh) // len(views)], radii[index])
             _native.sh_colours(*mine, view, degree, colours[index])
@@ -153,7 +155,8 @@ def blend_native(
     """As ``blend_reference``.
 
     Raises:
-        SplatpipeError: if the splats cover more of the images than memory or 32-bit indices allow.
+        SplatpipeError: if the splats cover more of the images than memory or 32-bit indices allow, or the images do
+            not fit into memory.
     """
     placed = (splats.depths.detach(), splats.determinants, splats.radii)
     leaves = (splats.means2d, splats.covariances, opacities, features, splats.slants, backgrounds)
@@ -175,7 +178,7 @@ class _Blend(torch.autograd.Function):
         values = tuple(None if leaf is None else leaf.detach().contiguous() for leaf in leaves)
         *splats, backgrounds = values
         v, n, d = len(placed[0]), placed[0].shape[1], leaves[3].shape[-1]  # type: ignore[union-attr]
-        shown, alpha = torch.empty(v, options.height, options.width, d), torch.empty(v, options.height, options.width)
+        shown, alpha = _new_images(placed[0], options, d)
         frames = []
         for index in range(v):
             frame = _native.FeatureFrame()
@@ -211,6 +214,19 @@ class _Blend(torch.autograd.Function):
         if backgrounds is not None and ctx.needs_input_grad[-1] and shown is not None:
             by_background = torch.einsum("vhwd,vhw->vd", shown, 1.0 - alpha)
         return None, None, None, *outputs, by_background
+
+
+def _new_images(depths: Float[Tensor, "v n"], options: BlendOptions, channels: int) -> tuple[Tensor, Tensor]:
+    """Features (v, h, w, d) and alpha (v, h, w), not filled."""
+    size = (len(depths), options.height, options.width)
+    try:
+        return depths.new_empty(*size, channels), depths.new_empty(size)
+    except RuntimeError as error:  # of torch's allocator
+        raise MachineError(
+            f"Not enough memory for {size[0]} images of {options.width} x {options.height} pixels with {channels} "
+            "channels.",
+            hint="Render fewer or smaller images at a time.",
+        ) from error
 
 
 def _of_splats(splats: Sequence[Tensor | None], index: int, views: int) -> tuple[Tensor | None, ...]:

@@ -46,11 +46,21 @@ class FusedAdam(torch.optim.Optimizer):
             ValueError: if a number is out of its range.
         """
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
-        for group in self.param_groups:
-            numbers = (group["lr"], *group["betas"], group["eps"])
-            fits = len(numbers) == 4 and all(math.isfinite(number) for number in numbers)
-            if not fits or group["lr"] < 0.0 or not all(0.0 <= b < 1.0 for b in group["betas"]) or group["eps"] <= 0.0:
-                raise ValueError(f"Adam cannot work with lr {group['lr']}, betas {group['betas']}, eps {group['eps']}.")
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Add tensors with their own numbers; torch calls this for the first groups as well.
+
+        Args:
+            param_group: ``params``, and those of ``lr``, ``betas`` and ``eps`` that are not the optimizer's.
+
+        Raises:
+            ValueError: if a number is out of its range.
+        """
+        lr, betas, eps = ((self.defaults | param_group)[name] for name in ("lr", "betas", "eps"))
+        fits = len(betas) == 2 and all(math.isfinite(number) for number in (lr, *betas, eps))
+        if not fits or lr < 0.0 or not all(0.0 <= beta < 1.0 for beta in betas) or eps <= 0.0:
+            raise ValueError(f"Adam cannot work with lr {lr}, betas {betas}, eps {eps}.")
+        super().add_param_group(param_group)
 
     @overload
     def step(self, closure: None = None, *, visible: Bool[Tensor, " n"] | None = None) -> None: ...
@@ -71,7 +81,7 @@ class FusedAdam(torch.optim.Optimizer):
             What the closure returned.
 
         Raises:
-            ValueError: if ``visible`` does not fit a parameter.
+            ValueError: if ``visible`` does not fit a parameter, or a gradient is sparse.
         """
         loss = None
         if closure is not None:
@@ -89,9 +99,12 @@ class FusedAdam(torch.optim.Optimizer):
                 f"visible is {tuple(visible.shape)} of {visible.dtype}, not a bool for each row of a parameter "
                 f"{tuple(parameter.shape)}."
             )
+        assert parameter.grad is not None
+        if parameter.grad.layout != torch.strided:
+            raise ValueError("a gradient is sparse: FusedAdam steps dense ones, and the rows of visible.")
         state = self.state[parameter]
         if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
             state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
             state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.contiguous_format)
         state["step"] += 1
@@ -118,7 +131,8 @@ def _rows(parameter: Tensor, moments: tuple[Tensor, Tensor], rate: float, visibl
     if visible is not None:
         visible = visible.repeat_interleave(row // width).to(torch.uint8)
     cut = [each.detach().contiguous().view(-1, width) for each in (parameter, parameter.grad, *moments)]
-    return AdamRows([cut[0]], [cut[1]], [cut[2]], [cut[3]], [torch.full((width,), rate)], visible)
+    rates = torch.full((width,), rate, dtype=torch.float32, device="cpu")
+    return AdamRows([cut[0]], [cut[1]], [cut[2]], [cut[3]], [rates], visible)
 
 
 def _step_plainly(

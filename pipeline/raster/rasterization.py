@@ -135,7 +135,8 @@ def rasterization(
         ValueError: if shapes, dtypes or devices do not fit each other, a value is not finite, or a number is out of
             range.
         NotImplementedError: for what is not there.
-        SplatpipeError: if the Gaussians cover more pixels than memory or 32-bit indices allow.
+        SplatpipeError: if the Gaussians cover more pixels than memory or 32-bit indices allow, or the images do not
+            fit into memory.
     """
     del channel_chunk, segmented
     refuse_what_is_not_there(
@@ -155,7 +156,7 @@ def rasterization(
             "a second pose (viewmats_rs)": viewmats_rs is not None,
         }
     )
-    scene = find_scene(means, quats, scales, opacities, colors, viewmats, sh_degree)
+    scene = find_scene(means, quats, scales, opacities, colors, viewmats, Ks, sh_degree)
     check_numbers(
         {"render_mode": render_mode, "rasterize_mode": rasterize_mode, "depth": depth},
         {"width": width, "height": height},
@@ -170,18 +171,18 @@ def rasterization(
         },
     )
     projection = ProjectionOptions(
-        near=near_plane,
-        far=far_plane,
-        blur_px2=eps2d,
-        plane_sigmas=plane_sigmas,
+        near=float(near_plane),
+        far=float(far_plane),
+        blur_px2=float(eps2d),
+        plane_sigmas=float(plane_sigmas),
         compensate=rasterize_mode == "antialiased",
-        compensation_min=compensation_min,
-        radius_clip=radius_clip,
+        compensation_min=float(compensation_min),
+        radius_clip=float(radius_clip),
         slants=render_mode != "RGB" and depth == "ray",
     )
-    scene = replace(scene, views=find_views(viewmats, Ks, int(width), int(height)))
+    scene = replace(scene, views=find_views(scene, viewmats, Ks, int(width), int(height)))
     behind = find_backgrounds(scene, backgrounds)
-    blending = BlendOptions(int(width), int(height), alpha_max)
+    blending = BlendOptions(int(width), int(height), float(alpha_max))
     shown, alpha, meta = _render(scene, projection, blending, behind, render_mode, absgrad)
     return shown, alpha, meta | {"width": width, "height": height, "tile_size": tile_size}
 

@@ -6,6 +6,7 @@ Shapes are not annotated here, because what checks them must take any.
 from __future__ import annotations
 
 import math
+import numbers
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -72,7 +73,7 @@ def refuse_what_is_not_there(asked: Mapping[str, object]) -> None:
             raise NotImplementedError(f"splatpipe's rasterization does not support {name}.")
 
 
-def check_numbers(choices: Mapping[str, str], sides: Mapping[str, object], numbers: Mapping[str, float]) -> None:
+def check_numbers(choices: Mapping[str, str], sides: Mapping[str, object], reals: Mapping[str, float]) -> None:
     """Check arguments that are no tensors, by their names.
 
     Raises:
@@ -82,16 +83,20 @@ def check_numbers(choices: Mapping[str, str], sides: Mapping[str, object], numbe
         if choice not in _CHOICES[name]:
             raise ValueError(f"{name} is {choice!r}; choose from {', '.join(_CHOICES[name])}.")
     for name, side in sides.items():
-        try:
-            fits = 1 <= operator.index(side) <= MAX_SIDE_PX  # type: ignore[arg-type]
-        except TypeError:
-            fits = False
-        if not fits:
+        if not 1 <= _whole(side) <= MAX_SIDE_PX:
             raise ValueError(f"{name} is {side!r}, not a whole number from 1 to {MAX_SIDE_PX}.")
-    for name, number in numbers.items():
+    for name, number in reals.items():
         least, most = _RANGES.get(name, (0.0, math.inf))
-        if not (isinstance(number, (int, float)) and least <= number <= most):
+        if not (isinstance(number, numbers.Real) and least <= number <= most):
             raise ValueError(f"{name} is {number!r}, not a number from {least} to {most}.")
+
+
+def _whole(value: object) -> int:
+    """A whole number of any type, NumPy's as well; -1 for what is none."""
+    try:
+        return operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        return -1
 
 
 def find_scene(
@@ -101,16 +106,17 @@ def find_scene(
     opacities: Tensor,
     colors: Tensor,
     viewmats: Tensor,
+    intrinsics: Tensor,
     sh_degree: int | None,
 ) -> Scene:
-    """Check the Gaussians' tensors; arguments as for ``rasterization``.
+    """Check the Gaussians' tensors; arguments as for ``rasterization``, of which ``Ks`` are the intrinsics.
 
     Raises:
         ValueError: if shapes, dtypes or devices do not fit each other, or a value is not finite.
         NotImplementedError: for spherical harmonics above degree 3.
     """
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    for name, tensor in (tensors | {"viewmats": viewmats}).items():
+    for name, tensor in (tensors | {"viewmats": viewmats, "Ks": intrinsics}).items():
         if not isinstance(tensor, Tensor):
             raise ValueError(f"{name} is no tensor but a {type(tensor).__name__}.")
     if means.ndim < 2 or viewmats.ndim < 3:
@@ -142,7 +148,7 @@ def find_scene(
         scales.reshape(s, n, 3),
         opacities.reshape(s, n),
         colors.reshape(s * c if per_view else s, *trailing),
-        sh_degree,
+        None if sh_degree is None else _whole(sh_degree),
     )
 
 
@@ -172,28 +178,33 @@ def _check_colors(colors: Tensor, lead: tuple[int, ...], c: int, n: int, sh_degr
     k = colors.shape[-2] if colors.ndim > 1 else 0
     if tuple(colors.shape) not in ((*lead, n, k, 3), (*lead, c, n, k, 3)):
         raise ValueError(f"colors is {tuple(colors.shape)}, neither (..., N, K, 3) nor (..., C, N, K, 3).")
-    if not isinstance(sh_degree, int) or sh_degree < 0:
+    degree = _whole(sh_degree)
+    if degree < 0:
         raise ValueError(f"sh_degree is {sh_degree!r}, not a whole number from 0.")
-    refuse_what_is_not_there({_SH_NOT_THERE: sh_degree > MAX_DEGREE})
-    if coefficient_count(sh_degree) > k:
-        raise ValueError(f"colors has {k} coefficients: degree {sh_degree} needs {coefficient_count(sh_degree)}.")
+    refuse_what_is_not_there({_SH_NOT_THERE: degree > MAX_DEGREE})
+    if coefficient_count(degree) > k:
+        raise ValueError(f"colors has {k} coefficients: degree {degree} needs {coefficient_count(degree)}.")
 
 
-def find_views(viewmats: Tensor, intrinsics: Tensor, width: int, height: int) -> tuple[View, ...]:
-    """The views of all poses (..., C, 4, 4) and intrinsics (..., C, 3, 3).
+def find_views(scene: Scene, viewmats: Tensor, intrinsics: Tensor, width: int, height: int) -> tuple[View, ...]:
+    """The views of a scene by all poses (..., C, 4, 4) and intrinsics (..., C, 3, 3).
 
     Raises:
-        ValueError: if shapes differ, a value is not finite, a pose cannot be inverted, or a focal length is not > 0.
-        NotImplementedError: if a gradient is wanted, or a camera is skewed.
+        ValueError: if shapes do not fit the scene, a value is not finite, a pose cannot be inverted, or a focal length
+            is not > 0.
+        NotImplementedError: if a gradient by them is wanted, or a camera is skewed.
     """
+    wanted = torch.is_grad_enabled()
     refuse_what_is_not_there(
-        {"a gradient to viewmats": viewmats.requires_grad, "a gradient to Ks": intrinsics.requires_grad}
+        {
+            "a gradient to viewmats": wanted and viewmats.requires_grad,
+            "a gradient to Ks": wanted and intrinsics.requires_grad,
+        }
     )
-    lead = tuple(viewmats.shape[:-2])
-    _check_shape("viewmats", viewmats, (*lead, 4, 4))
-    _check_shape("Ks", intrinsics, (*lead, 3, 3))
-    poses = viewmats.to("cpu", torch.float64).reshape(-1, 4, 4)
-    ks = intrinsics.to("cpu", torch.float64).reshape(-1, 3, 3)
+    _check_shape("viewmats", viewmats, (*scene.lead, scene.cameras, 4, 4))
+    _check_shape("Ks", intrinsics, (*scene.lead, scene.cameras, 3, 3))
+    poses = viewmats.detach().to("cpu", torch.float64).reshape(-1, 4, 4)
+    ks = intrinsics.detach().to("cpu", torch.float64).reshape(-1, 3, 3)
     check_finite("viewmats", poses)
     check_finite("Ks", ks)
     if not bool((poses[:, 3] == poses.new_tensor([0.0, 0.0, 0.0, 1.0])).all()):

@@ -145,6 +145,42 @@ def test_adam_evaluates_a_closure() -> None:
     assert (leaf < 1.0).all()
 
 
+def test_adam_steps_the_same_whatever_torchs_defaults() -> None:
+    usual, _ = trained(FusedAdam, 1)
+    leaves, optimizer = trained(FusedAdam, 0)
+    generator = torch.Generator().manual_seed(2)
+    for shape in SHAPES:
+        torch.randn(shape, generator=generator)
+    for leaf in leaves:
+        leaf.grad = torch.randn(leaf.shape, generator=generator)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            optimizer.step()
+    finally:
+        torch.set_default_dtype(before)
+    assert all(torch.equal(a, b) for a, b in zip(leaves, usual, strict=True))
+
+
+def test_adam_refuses_a_sparse_gradient() -> None:
+    leaf = torch.ones(3, 2, requires_grad=True)
+    leaf.grad = torch.sparse_coo_tensor(torch.tensor([[1]]), torch.ones(1, 2), (3, 2), check_invariants=True)
+    with pytest.raises(ValueError, match="sparse"):
+        FusedAdam([leaf]).step()
+    assert (leaf == 1.0).all()
+
+
+@pytest.mark.parametrize("named", [{"betas": (2, 3)}, {"betas": (0.9,)}, {"lr": math.inf}, {"eps": -1.0}])
+def test_adam_refuses_hostile_numbers_of_a_group(named: dict[str, float]) -> None:
+    optimizer = FusedAdam([torch.zeros(1, requires_grad=True)])
+    with pytest.raises(ValueError, match="Adam cannot work"):
+        optimizer.add_param_group({"params": [torch.zeros(2, requires_grad=True)], **named})
+    assert len(optimizer.param_groups) == 1
+    optimizer.add_param_group({"params": [torch.zeros(2, requires_grad=True)], "betas": (0.5, 0.9)})
+    assert [group["betas"] for group in optimizer.param_groups] == [(0.9, 0.999), (0.5, 0.9)]
+
+
 @pytest.mark.parametrize("named", [{"lr": -1.0}, {"lr": math.nan}, {"betas": (0.9, 1.0)}, {"eps": 0.0}])
 def test_adam_refuses_hostile_numbers(named: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="Adam cannot work"):

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from random_scene import random_camera, random_scene
 from torch import Tensor
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.raster.definitions import RenderOptions
 from splatpipe.pipeline.raster.rasterization import rasterization
@@ -77,8 +79,9 @@ def exact_slanted(render_mode: str, channels: int) -> tuple[Tensor, dict[str, Te
 
 
 @pytest.mark.usefixtures("isa")
-@pytest.mark.parametrize("channels", [1, 3, 6])
-@pytest.mark.parametrize("render_mode", ["RGB", "D", "RGB+D"])
+@pytest.mark.parametrize(
+    ("render_mode", "channels"), [("RGB", 3), ("RGB", 6), ("D", 3), ("RGB+D", 1), ("RGB+D", 3), ("RGB+D", 6)]
+)
 def test_slanted_depths_and_magnitudes_agree_with_the_reference(render_mode: str, channels: int) -> None:
     ours, exact = slanted(render_mode, channels, torch.float32), exact_slanted(render_mode, channels)
     assert (ours[0] - exact[0]).abs().max() < DEPTH
@@ -140,6 +143,64 @@ def test_batches_render_as_their_scenes_do() -> None:
         grad = batch["means"].grad
         assert grad is not None
         torch.testing.assert_close(grad.view(6, 20, 3)[index], expected_gradients["means"])
+
+
+@pytest.mark.parametrize(
+    ("poses", "ks"), [((3, 2, 1), (3, 2, 1)), ((6, 1), (6, 1)), ((1,), (1,)), ((2, 3, 1), (3, 2, 1))]
+)
+def test_views_of_other_batches_are_refused(poses: tuple[int, ...], ks: tuple[int, ...]) -> None:
+    given = scene(count=4)
+    batch = {name: given[name].detach().expand(2, 3, *given[name].shape) for name in LEAVES}
+    viewmats, intrinsics = given["viewmats"][0].expand(*poses, 4, 4), given["Ks"][0].expand(*ks, 3, 3)
+    with pytest.raises(ValueError, match=r"(viewmats|Ks) is .*, not \(2, 3, 1, "):
+        rasterization(**batch, viewmats=viewmats, Ks=intrinsics, **SIZE)
+
+
+@contextmanager
+def other_defaults() -> Iterator[None]:
+    """New tensors are float64, and on a device without memory."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.device("meta"):
+            yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("sh_degree", [None, 1])
+def test_torchs_default_dtype_and_device_do_not_matter(sh_degree: int | None, dtype: torch.dtype) -> None:
+    named: dict[str, Any] = {"render_mode": "RGB+ED", "rasterize_mode": "antialiased", "depth": "ray", "absgrad": True}
+    outcomes = []
+    for defaults in (nullcontext, other_defaults):
+        given = scene(dtype, count=20)
+        if sh_degree is not None:
+            given["colors"] = given["colors"].detach()[:, None].repeat(1, 4, 1).requires_grad_()
+        backgrounds = given["means"].new_ones(1, 3, requires_grad=True)
+        with defaults():
+            images, alphas, _ = rasterization(**given, **SIZE, **named, sh_degree=sh_degree, backgrounds=backgrounds)
+            (images.square().sum() + alphas.sum()).backward()
+        outcomes.append([images.detach(), alphas.detach(), backgrounds.grad, *[given[name].grad for name in LEAVES]])
+    for usual, other in zip(*outcomes, strict=True):
+        assert usual is not None and other is not None and torch.equal(usual, other)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    given = scene() | {"colors": torch.ones(50, 4, 3)}
+    usual = rasterization(**given, **SIZE, near_plane=0.25, alpha_max=0.5, sh_degree=1)[0]
+    size = {name: np.int64(side) for name, side in SIZE.items()}
+    numbers = {"near_plane": np.float32(0.25), "alpha_max": np.float64(0.5), "sh_degree": np.int64(1)}
+    assert torch.equal(rasterization(**given, **size, **numbers)[0], usual)  # type: ignore[arg-type]
+
+
+def test_poses_with_a_gradient_render_where_none_is_wanted() -> None:
+    given = scene()
+    usual = rasterization(**given, **SIZE)[0]
+    for name in ("viewmats", "Ks"):
+        given[name].requires_grad_()
+    with torch.no_grad():
+        assert torch.equal(rasterization(**given, **SIZE)[0], usual)
 
 
 def test_meta_is_what_gsplats_strategies_read() -> None:
@@ -274,6 +335,8 @@ def cut(name: str, dim: int) -> Callable[[dict[str, Any]], None]:
         (set_argument("viewmats", torch.zeros(0, 4, 4)), "no view"),
         (set_argument("viewmats", torch.zeros(1, 4, 4)), "last row"),
         (set_argument("viewmats", torch.tensor([[[0.0] * 4] * 3 + [[0.0, 0.0, 0.0, 1.0]]])), "inverted"),
+        (set_argument("Ks", None), "Ks is no tensor"),
+        (set_argument("Ks", np.eye(3)[None]), "Ks is no tensor"),
         (set_argument("Ks", torch.zeros(1, 3, 3)), "last row"),
         (set_argument("Ks", torch.diag(torch.tensor([0.0, 1.0, 1.0]))[None]), "focal length"),
         (set_argument("backgrounds", torch.zeros(3)), "backgrounds"),
@@ -327,6 +390,12 @@ def test_what_is_not_there_is_said_in_words(name: str, value: object) -> None:
     given: dict[str, Any] = scene() | SIZE | {name: value}
     with pytest.raises(NotImplementedError, match="does not support"):
         rasterization(**given)
+
+
+def test_images_that_no_memory_holds_are_refused() -> None:
+    given = scene(count=1, channels=65_536)
+    with pytest.raises(MachineError, match="1 images of 65536 x 65536 pixels with 65536 channels"):
+        rasterization(**given, width=65_536, height=65_536)
 
 
 def test_more_splats_than_memory_holds_are_refused() -> None:
