@@ -240,8 +240,9 @@ format: .venv/.dev
 types: $(EITHER) .venv/.dev
 	@$(BIN)/mypy -p splatpipe.pipeline -p splatpipe.stages
 
+# On the sources: a wheel leaves out the demo's generator.
 layers: $(EITHER) .venv/.dev
-	@$(BIN)/lint-imports
+	@$(BIN)/python tests/links.py --sources build/links && PYTHONPATH=build/links $(BIN)/lint-imports
 
 # Wheels for other machines: for this Python, and (PYTHONS=python3.13) one by the stable ABI for all from 3.12 on. Debian
 # 12's GCC gives the released ones: another may give other bits, and may need a newer C++ library.

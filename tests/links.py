@@ -22,15 +22,20 @@ PATH_FILE = "splatpipe_links.pth"
 CHECK = "import splatpipe.pipeline as p, sys; sys.exit(not p.__file__.startswith(sys.argv[1]))"
 
 
-def main(wheel: Path) -> None:
-    """Install links in place of a wheel."""
+def link_sources(folder: Path) -> None:
+    """Make a folder from which splatpipe can be imported as it is in the sources, with what a wheel leaves out."""
     with (ROOT / "pyproject.toml").open("rb") as file:
         folders = tomllib.load(file)["tool"]["scikit-build"]["wheel"]["packages"]
     for installed, source in folders.items():
-        link = LINKS / installed
+        link = folder / installed
         link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         link.symlink_to(ROOT / source)
+
+
+def main(wheel: Path) -> None:
+    """Install links in place of a wheel."""
+    link_sources(LINKS)
     for library in (LINKS / "splatpipe" / "pipeline" / "native").glob("lib*.so"):
         library.unlink()  # CUDA's, which this wheel may lack
     with zipfile.ZipFile(wheel) as archive, tempfile.TemporaryDirectory() as scratch:
@@ -69,4 +74,7 @@ def _digest(content: bytes) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    if sys.argv[1] == "--sources":
+        link_sources(Path(sys.argv[2]))
+    else:
+        main(Path(sys.argv[1]))

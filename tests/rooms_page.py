@@ -7,14 +7,19 @@ The rooms come from import-linter's contracts in ``pyproject.toml`` and from the
 from __future__ import annotations
 
 import ast
+import functools
+import json
+import os
 import re
+import subprocess
 import sys
+import tempfile
 import textwrap
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-import grimp
+from links import link_sources
 
 from splatpipe.pipeline.engine.stage import Stage
 from splatpipe.stages.line import LINE
@@ -22,6 +27,11 @@ from splatpipe.stages.line import LINE
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PACKAGE = "splatpipe"
+IMPORTS = (
+    "import grimp, json, sys\n"
+    "graph = grimp.build_graph(sys.argv[1], cache_dir=None)\n"
+    "print(json.dumps({each: sorted(graph.find_modules_directly_imported_by(each)) for each in graph.modules}))"
+)
 ROOMS = f"{PACKAGE}.pipeline"
 STAGES = f"{PACKAGE}.stages"  # drawn among the rooms: above the libraries, below the apps
 SOURCE = "source"  # what a stage reads of the user's files
@@ -79,13 +89,25 @@ def containers() -> dict[str, list[str]]:
 
 def room_imports(rooms: Iterable[str]) -> dict[str, set[str]]:
     """Return, for each room, the others that its modules import."""
-    imports = grimp.build_graph(PACKAGE, cache_dir=None)
-    room_of = {module: room for room in rooms for module in {room, *imports.find_descendants(room)}}
+    imports = source_imports()
+    room_of = {module: room for room in rooms for module in imports if f"{module}.".startswith(f"{room}.")}
     edges: dict[str, set[str]] = {room: set() for room in rooms}
     for module, room in room_of.items():
-        targets = {room_of.get(each) for each in imports.find_modules_directly_imported_by(module)}
+        targets = {room_of.get(each) for each in imports[module]}
         edges[room] |= {target for target in targets if target and target != room}
     return edges
+
+
+@functools.cache
+def source_imports() -> Mapping[str, list[str]]:
+    """Return what each module of the sources imports of splatpipe; in a process that has not imported a wheel's."""
+    with tempfile.TemporaryDirectory() as folder:
+        link_sources(Path(folder))
+        environment = {**os.environ, "PYTHONPATH": folder}
+        command = [sys.executable, "-P", "-c", IMPORTS, PACKAGE]
+        done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    found: Mapping[str, list[str]] = json.loads(done.stdout)
+    return found
 
 
 def reduced(edges: Edges) -> dict[str, set[str]]:
