@@ -192,6 +192,7 @@ def unpack(pack: Path) -> Row:
         shutil.rmtree(folder, ignore_errors=True)
     for room in ROOMS:
         shutil.copytree(ROOT / room, packages / "splatpipe" / room, ignore=UNUSED)
+    shutil.copy2(ROOT / "pipeline/door/__init__.py", packages / "splatpipe")
     for wheel in sorted((pack / "wheels").glob("*.whl")):
         with zipfile.ZipFile(wheel) as archive:
             archive.extractall(site)

@@ -247,6 +247,7 @@ class Workshop:
         subprocess.run(["git", "clone", "-q", str(ROOT), str(self.clone)], check=True)
         for name in ("pipeline", "stages", "configs", "demo"):
             (links / name).symlink_to(self.clone / name)
+        (links / "__init__.py").symlink_to(self.clone / "pipeline/door/__init__.py")
         found = importlib.util.find_spec("splatpipe.pipeline")
         assert found is not None and found.origin is not None
         installed = Path(found.origin).resolve().parent

@@ -20,6 +20,7 @@ FOLDERS = ("pipeline", "stages", "configs", "demo")  # as pyproject.toml maps th
 KERNELS = {"pipeline/native": "pipeline/native", "pipeline/raster/native": "pipeline/raster"}
 """Folders of the kernels' sources, now and before, and those of the module made from them."""
 PAGES = Path("pipeline/web")
+DOOR = Path("pipeline/door/__init__.py")
 Say = Callable[[str], None]
 
 
@@ -58,6 +59,7 @@ def take_commit(checkout: Path, commit: str, folder: Path) -> Tree:
     packed = git(checkout, "archive", commit, *FOLDERS)
     with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
         archive.extractall(folder / PACKAGE, filter="data")
+    _make_package(folder / PACKAGE)
     return Tree(folder, _command(git(checkout, "show", f"{commit}:pyproject.toml").decode()))
 
 
@@ -69,7 +71,14 @@ def take_working(checkout: Path, folder: Path) -> Tree:
             target = folder / PACKAGE / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(checkout / name, target)
+    _make_package(folder / PACKAGE)
     return Tree(folder, _command((checkout / "pyproject.toml").read_text(encoding="utf-8")))
+
+
+def _make_package(folder: Path) -> None:
+    """Write the package's own file, empty where a commit has none: without it, an installed splatpipe comes first."""
+    door = folder / DOOR
+    (folder / "__init__.py").write_bytes(door.read_bytes() if door.is_file() else b"")
 
 
 def _command(project: str) -> str:

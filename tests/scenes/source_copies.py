@@ -11,6 +11,7 @@ from pathlib import Path
 import record
 from repository import ROOT
 
+DOOR = "pipeline/door/__init__.py"  # the package's own file: without it, an installed splatpipe comes first
 MADE = ("*.so", "__pycache__", "dist", "node_modules", record.RECORD)
 
 
@@ -18,6 +19,7 @@ def copy_sources(target: Path, *besides: str) -> Path:
     """Copy the sources except build products and ``besides``; record them."""
     for folder in ("pipeline", "stages", "configs", "demo"):
         shutil.copytree(ROOT / folder, target / folder, ignore=shutil.ignore_patterns(*MADE, *besides))
+    shutil.copy2(ROOT / DOOR, target)
     record.write(target, record.present(target))
     return target
 
