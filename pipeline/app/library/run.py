@@ -17,7 +17,7 @@ from splatpipe.pipeline.app.library.trained_scene import in_model_frame, in_worl
 from splatpipe.pipeline.app.library.user_errors import user_errors
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.files.json_file import read_json
-from splatpipe.pipeline.engine.files.output_file import write_file
+from splatpipe.pipeline.engine.files.output_file import require_replaceable, write_file
 from splatpipe.pipeline.engine.machine import available_cores
 from splatpipe.pipeline.engine.runs.run_folder import RunFolder, open_run_folder
 from splatpipe.pipeline.geometry.camera import Camera
@@ -60,6 +60,7 @@ class Render:
             SplatpipeError: if it cannot be written.
         """
         with user_errors():
+            require_replaceable(Path(path).expanduser())
             write_file(Path(path).expanduser(), self.png())
 
     def _repr_png_(self) -> bytes:

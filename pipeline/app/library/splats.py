@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from splatpipe.pipeline.app.library.user_errors import user_errors
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
@@ -28,7 +29,8 @@ ALMOST_ONE = float(np.nextafter(np.float32(1.0), np.float32(0.0)))  # the larges
 class Splat:
     """n Gaussians with the parameters that splat files hold, and where they lie.
 
-    Arrays of other types are converted to float32; those of other shapes raise a ``SplatpipeError``.
+    Arrays of other types, and tensors, are converted to float32; those of other shapes raise a ``SplatpipeError``. Far
+    coordinates in float64 get an ``origin``.
 
     Attributes:
         means: Centres, less ``origin``.
@@ -61,15 +63,37 @@ class Splat:
     _edits: tuple[Mapping[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ARRAYS:
-            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), np.float32))
-        n = len(self.means)
+        centres = _array(self.means, "means")
+        object.__setattr__(self, "means", np.ascontiguousarray(centres, np.float32))
+        for name in ARRAYS[1:]:
+            object.__setattr__(self, name, np.ascontiguousarray(_array(getattr(self, name), name), np.float32))
+        n = self.means.shape[0] if self.means.ndim else 0
         expected = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,)}
         shapes = {name: getattr(self, name).shape for name in expected}
         if shapes != expected or self.sh.shape not in [(n, (degree + 1) ** 2, 3) for degree in range(4)]:
             listed = ", ".join(f"{name} {getattr(self, name).shape}" for name in ARRAYS)
             raise UsageError(f"The arrays have shapes that do not fit: {listed}.", hint="See splatpipe.Splat.")
         object.__setattr__(self, "origin", tuple(float(number) for number in self.origin))
+        if centres.dtype != np.float32:
+            self._take_off_origin(centres)
+
+    def _take_off_origin(self, centres: NDArray[Any]) -> None:
+        """Keep the accuracy of far coordinates.
+
+        Raises:
+            UsageError: if the splat has a place, about which its coordinates are.
+        """
+        middle = np.median(centres.astype(np.float64), axis=0) if len(centres) else np.zeros(3)
+        if not FAR < np.abs(middle).max() < np.inf:
+            return
+        if self.place is not None:
+            raise UsageError(
+                f"The splat lies {np.abs(middle).max():.0f} from its place.",
+                hint="Give means about its place; or coordinates in a CRS without a place, and call georeferenced.",
+            )
+        taken = np.rint(middle)
+        object.__setattr__(self, "means", np.ascontiguousarray(centres - taken, np.float32))
+        object.__setattr__(self, "origin", tuple((np.array(self.origin) + taken).tolist()))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -112,14 +136,20 @@ class Splat:
         Raises:
             SplatpipeError: if a scale is not positive, or an opacity not in its range.
         """
-        sizes, shares = np.asarray(scales, np.float64), np.asarray(opacities, np.float64)
+        sizes = _array(scales, "scales").astype(np.float64)
+        shares = _array(opacities, "opacities").astype(np.float64)
         if not (sizes > 0.0).all() or not ((shares >= 0.0) & (shares <= 1.0)).all():
             raise UsageError("Scales must be positive, and opacities between 0 and 1.", hint="Activate them first.")
         kept = np.clip(shares, 1.0 - ALMOST_ONE, ALMOST_ONE)
         return cls(means, np.log(sizes), quats, np.log(kept / (1.0 - kept)), sh, **where)
 
     def turned(self, axes: Axes) -> Splat:
-        """The same splat with other axes, harmonics included."""
+        """The same splat with other axes, harmonics included.
+
+        Raises:
+            SplatpipeError: if there are no such axes.
+        """
+        _check_axes(axes)
         return _splat(_scene(self).turned(axes))
 
     def transformed(self, similarity: Similarity) -> Splat:
@@ -182,6 +212,8 @@ def read_splat(path: Path | str, *, axes: Axes | None = None) -> Splat:
     """
     from splatpipe.pipeline.splat.formats.files import read_scene
 
+    if axes is not None:
+        _check_axes(axes)
     with user_errors():
         splat = _splat(read_scene(Path(path).expanduser()))
     return splat if axes is None else replace(splat, axes=axes)
@@ -214,6 +246,24 @@ def write_splat(path: Path | str, splat: Splat, *, format: str | None = None) ->
         if format in FOLDERS:
             return FOLDERS[format](path, scene)
         return write_scene(path, scene, format_of_name(path, format)).warnings()
+
+
+def _array(values: Any, name: str) -> NDArray[Any]:
+    """Numbers as an array, without the gradients of a tensor.
+
+    Raises:
+        UsageError: if they are none.
+    """
+    try:
+        found = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
+        return found if found.dtype == np.float32 else found.astype(np.float64)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise UsageError(f"{name} is not an array of numbers.", hint="See splatpipe.Splat.") from error
+
+
+def _check_axes(axes: str) -> None:
+    if axes not in get_args(Axes):
+        raise UsageError(f'There are no axes "{axes}".', hint=f"Choose from {', '.join(get_args(Axes))}.")
 
 
 def _scene(splat: Splat) -> Scene:

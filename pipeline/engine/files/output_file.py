@@ -145,6 +145,20 @@ def require_own_files(paths: Iterable[Path]) -> None:
         _require(path, files=True, folders=True)
 
 
+def require_replaceable(path: Path) -> None:
+    """Check that a path which a user named is no device: root could remove it, which breaks the machine.
+
+    Raises:
+        UsageError: if it is a device, pipe or socket, or a link to one.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # nothing, or a link to nothing; what else is wrong shows when it is written
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise UsageError(f"{path} is {kind_of(mode)}, which splatpipe does not replace.", hint="Choose another name.")
+
+
 def token() -> str:
     """An unpredictable part of a temporary file's name: nobody can make such a file or link before we do."""
     return os.urandom(8).hex()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError
 from splatpipe.pipeline.engine.files.durable import beside
+from splatpipe.pipeline.engine.files.output_file import require_replaceable
 from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.formats.catalogue import SPLAT_FORMATS, SplatFormat, format_named
@@ -88,7 +89,7 @@ def format_of_name(path: Path, asked: str | None = None) -> SplatFormat:
     if not fits:
         endings = ", ".join(dict.fromkeys(each.ending for each in SPLAT_FORMATS if each.ending))
         raise UsageError(
-            f"No format has the extension {path.suffix}.", hint=f"Choose from {endings}, or set it with --format."
+            f"No format has the extension {path.suffix}.", hint=f"Choose from {endings}, or name the format."
         )
     return max(fits, key=lambda each: len(each.ending))
 
@@ -105,11 +106,12 @@ def write_scene(path: Path, scene: Scene, kind: SplatFormat | None = None) -> Po
         What the file's positions have lost.
 
     Raises:
-        UsageError: if the name has no known suffix, or a folder is not empty.
+        UsageError: if the name has no known suffix, a folder is not empty, or the path is a device, pipe or socket.
         SplatpipeError: if the format cannot store the scene, or only so coarsely that it would be destroyed.
         MachineError: if it cannot be written.
     """
     kind = format_of_name(path) if kind is None else kind
+    require_replaceable(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir() and (kind.ending or any(path.iterdir())):

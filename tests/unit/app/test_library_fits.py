@@ -74,3 +74,32 @@ def test_points_that_determine_nothing_are_refused(
     with pytest.raises(splatpipe.SplatpipeError, match=message) as caught:
         splatpipe.fit_similarity(source, target, sigmas)  # type: ignore[arg-type]
     assert caught.value.hint
+
+
+@pytest.mark.parametrize("count", [4, 5, 6, 8, 12])
+def test_mirrored_or_unrelated_points_are_refused(count: int) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points = 10.0 * rng.normal(size=(count, 3))
+        for target in (points * [1.0, 1.0, -1.0], 10.0 * rng.normal(size=(count, 3))):
+            with pytest.raises(splatpipe.SplatpipeError, match="contradict each other"):
+                splatpipe.fit_similarity(points, target, 0.01)
+
+
+def test_three_points_that_are_off_by_far_more_than_their_sigmas_are_refused() -> None:
+    wrong = SITE[:3] + np.array([[5.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -5.0, 0.0]])
+    with pytest.raises(splatpipe.SplatpipeError, match="times their sigmas"):
+        splatpipe.fit_similarity(MODEL[:3], wrong, 0.001)
+    assert splatpipe.fit_similarity(MODEL[:3], wrong, 0.001, max_error=10.0).inliers.all()
+
+
+def test_one_wrong_point_of_five_is_left_out() -> None:
+    wrong = SITE[:5].copy()
+    wrong[0, 2] += 4.0
+    assert splatpipe.fit_similarity(MODEL[:5], wrong, SIGMA).inliers.tolist() == [False, True, True, True, True]
+
+
+@pytest.mark.parametrize("max_error", [float("nan"), -1.0, 0.0])
+def test_a_limit_that_is_none_is_named(max_error: float) -> None:
+    with pytest.raises(splatpipe.SplatpipeError, match="max_error"):
+        splatpipe.fit_similarity(MODEL, SITE, SIGMA, max_error=max_error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,3 +168,28 @@ def test_axes_can_be_stated_where_a_file_does_not_say_them(tmp_path: Path) -> No
     assert splatpipe.read_splat(tmp_path / "splat.ply").axes == "y down"
     stated = splatpipe.read_splat(tmp_path / "splat.ply", axes="z up")
     assert stated.axes == "z up" and same_arrays(stated, some_splat())
+
+
+@pytest.mark.parametrize("name", ["splat.ply", "splat.sog", "splat.spz", "splat.glb", "link.ply"])
+def test_a_pipe_is_not_replaced(tmp_path: Path, name: str) -> None:
+    pipe = tmp_path / ("pipe" if name == "link.ply" else name)
+    os.mkfifo(pipe)
+    if name == "link.ply":
+        (tmp_path / name).symlink_to(pipe)
+    with pytest.raises(splatpipe.SplatpipeError, match="is a named pipe, which splatpipe does not replace") as caught:
+        splatpipe.write_splat(tmp_path / name, some_splat())
+    assert caught.value.hint and pipe.is_fifo()
+
+
+def test_far_means_in_float64_get_an_origin() -> None:
+    splat = replace(some_splat(), place=None)
+    grid = splat.means.astype(np.float64) + np.array([388_720.25, 5_299_720.125, 510.0])
+    rest = (splat.log_scales, splat.quats, splat.opacity_logits, splat.sh)
+    activated = (splat.scales, splat.quats, splat.opacities, splat.sh)
+    for made in (Splat(grid, *rest), Splat.of_activated(grid, *activated)):
+        assert np.abs(made.means.astype(np.float64) + made.origin - grid).max() < 1e-5
+    shifted = Splat(grid - 1000.0, *rest, origin=(1000.0, 1000.0, 1000.0))
+    assert np.abs(shifted.means.astype(np.float64) + shifted.origin - grid).max() < 1e-5
+    with pytest.raises(splatpipe.SplatpipeError, match="from its place") as caught:
+        Splat(grid, *rest, place=PLACE)
+    assert caught.value.hint
