@@ -76,20 +76,22 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Load a public name when it is first used."""
-    import importlib
+if not TYPE_CHECKING:  # or else type checkers accept any name
 
-    if name == "__version__":
-        import importlib.metadata
+    def __getattr__(name: str) -> Any:
+        """Load a public name when it is first used."""
+        import importlib
 
-        value: Any = importlib.metadata.version("splatpipe")
-    elif name in _MODULES:
-        value = getattr(importlib.import_module(f"splatpipe.pipeline.{_MODULES[name]}"), name)
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value
-    return value
+        if name == "__version__":
+            import importlib.metadata
+
+            value: Any = importlib.metadata.version("splatpipe")
+        elif name in _MODULES:
+            value = getattr(importlib.import_module(f"splatpipe.pipeline.{_MODULES[name]}"), name)
+        else:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

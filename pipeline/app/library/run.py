@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 METRICS, GEOREFERENCE, REPORT = "metrics.json", "georef.json", "report.html"
 Vector = Sequence[float] | NDArray[Any]
+MAX_SIDE_PX = 65_536  # of a render
 What = Literal["colour", "depth", "normals"]
 
 
@@ -236,14 +237,18 @@ def look_at(
         width: Pixels.
         height: Pixels.
         angle_deg: Field of view along the longer side.
-        up: What is up in the image; straight up or down, y is.
+        up: What is up in the image; where the camera looks along it, y is, or z along y.
 
     Raises:
-        SplatpipeError: if both places are the same, or a number is not finite.
+        SplatpipeError: if both places are the same, or a number is not finite or not in its range.
     """
     from splatpipe.pipeline.film.camera_path import FilmCamera
 
     place, aim, above = (np.asarray(vector, np.float64) for vector in (eye, target, up))
+    if not all(vector.shape == (3,) and np.isfinite(vector).all() for vector in (place, aim, above)) or not above.any():
+        raise UsageError("Eye, target and up are three finite numbers each, and up is not zero.", hint="Give x, y, z.")
+    if not all(isinstance(side, int) and 0 < side <= MAX_SIDE_PX for side in (width, height)):
+        raise UsageError(f"An image of {width} × {height} pixels cannot be drawn.", hint=f"1 to {MAX_SIDE_PX} a side.")
     ahead = aim - place
     if not 0.0 < float(np.linalg.norm(ahead)) < np.inf or not 0.0 < angle_deg < 180.0:
         raise UsageError(
@@ -253,7 +258,7 @@ def look_at(
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, above)
     if np.linalg.norm(right) < 1e-6 * np.linalg.norm(above):
-        right = np.cross(ahead, [0.0, 1.0, 0.0])
+        right = np.cross(ahead, [0.0, 1.0, 0.0] if abs(ahead[1]) < 0.9 else [0.0, 0.0, 1.0])
     right = right / np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])

@@ -18,7 +18,11 @@ means, log_scales, quats, logits, sh = trained
 assert len(Splat.of_activated(means, log_scales.exp(), quats, logits.sigmoid(), sh)) == 5
 far = Splat([[4e5 + 0.125, 5e6, 0.0]] * 5, *trained[1:])
 assert far.means[0, 0] + far.origin[0] == 4e5 + 0.125
+assert np.isfinite(splatpipe.look_at((0, 0, 0), (0, 5, 0), up=(0, 1, 0)).cam_from_world).all()
 for call, said in (
+    (lambda: splatpipe.look_at((0, 0, 9), (0, 0, 0), up=(0, 0, 0)), "up is not zero"),
+    (lambda: splatpipe.look_at((0, 0, 9), (0, 0, float("nan"))), "finite"),
+    (lambda: splatpipe.look_at((0, 0, 9), (0, 0, 0), width=64.5), "cannot be drawn"),
     (lambda: Splat(*trained[:4], "sh"), "sh is not an array"),
     (lambda: splat.turned("sideways"), "no axes"),
     (lambda: splatpipe.read_splat("missing.ply", axes="sideways"), "no axes"),
