@@ -311,6 +311,7 @@ def test_a_carried_library_that_does_not_fit_is_compiled_there(
     carried.mkdir()
     (carried / "_native.abi3.so").write_bytes(b"of another machine")
     shutil.copytree(NATIVE.parent, packages / "splatpipe" / "pipeline", ignore=gpu_visit.UNUSED)
+    shutil.copy2(NATIVE.parent / "door" / "__init__.py", packages / "splatpipe")
     monkeypatch.setenv("SPLATPIPE_HARNESS", str(place.library))
     monkeypatch.setattr(gpu_libraries, "_compile_here", lambda scratch, target: good)
     said = gpu_libraries.place(carried, packages, tmp_path)
