@@ -1,6 +1,7 @@
 """Commands on an OUT, with all that belongs to them: lock, log, worker, viewer and report, whatever happens.
 
-The command line and the library call the same functions; they differ in who watches.
+The command line and the library call the same functions; they differ in who watches. Light to import: every command
+of the command line loads it.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StopSignal
-from splatpipe.pipeline.engine.events import Event
 
 if TYPE_CHECKING:
+    from splatpipe.pipeline.engine.events import Event
     from splatpipe.pipeline.engine.runs.runner import Outcome, Runner
     from splatpipe.pipeline.engine.runs.session import Request
 
@@ -39,6 +40,8 @@ class Watch:
 
     def message(self, text: str) -> None:
         """Receive a message about the whole run, in a sentence or two; by default as an event, a note."""
+        from splatpipe.pipeline.engine.events import Event
+
         self.event(Event("note", data={"message": text}))
 
     def pause(self) -> None:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 METRICS, GEOREFERENCE, REPORT = "metrics.json", "georef.json", "report.html"
 Vector = Sequence[float] | NDArray[Any]
-MAX_SIDE_PX = 65_536  # of a render
 What = Literal["colour", "depth", "normals"]
 
 
@@ -126,7 +125,7 @@ class Run:
             points = load_points(self._part("undistort.dataset"))
             return SparsePoints(self._world_from_model.apply(points.xyz), points.rgb)
 
-    @property
+    @cached_property
     def metrics(self) -> dict[str, Any]:
         """The content of `metrics.json`: photos placed, errors, PSNR of held-out photos, accuracy; docs/products.md.
 
@@ -135,7 +134,7 @@ class Run:
         """
         return self._json(METRICS)
 
-    @property
+    @cached_property
     def georeference(self) -> dict[str, Any]:
         """The content of `georef.json`: origin, CRS, the exact way to its coordinates; docs/coordinates.md.
 
@@ -247,8 +246,8 @@ def look_at(
     place, aim, above = (np.asarray(vector, np.float64) for vector in (eye, target, up))
     if not all(vector.shape == (3,) and np.isfinite(vector).all() for vector in (place, aim, above)) or not above.any():
         raise UsageError("Eye, target and up are three finite numbers each, and up is not zero.", hint="Give x, y, z.")
-    if not all(isinstance(side, int) and 0 < side <= MAX_SIDE_PX for side in (width, height)):
-        raise UsageError(f"An image of {width} × {height} pixels cannot be drawn.", hint=f"1 to {MAX_SIDE_PX} a side.")
+    if not all(isinstance(side, int | np.integer) and side > 0 for side in (width, height)):
+        raise UsageError(f"An image of {width} × {height} pixels cannot be drawn.", hint="Give whole numbers.")
     ahead = aim - place
     if not 0.0 < float(np.linalg.norm(ahead)) < np.inf or not 0.0 < angle_deg < 180.0:
         raise UsageError(
@@ -264,4 +263,4 @@ def look_at(
     pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
     pose[:3, 3] = -pose[:3, :3] @ place
     lens = FilmCamera.of_angle(width, height, angle_deg)
-    return Camera("view", width, height, lens.focal_px, lens.focal_px, width / 2.0, height / 2.0, pose)
+    return Camera("view", int(width), int(height), lens.focal_px, lens.focal_px, width / 2.0, height / 2.0, pose)
