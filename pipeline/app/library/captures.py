@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,7 @@ from splatpipe.pipeline.app.library.requests import (
 )
 from splatpipe.pipeline.app.library.run import Run, open_run
 from splatpipe.pipeline.app.library.user_errors import user_errors
-from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.events import Event
 
 if TYPE_CHECKING:
@@ -31,16 +32,35 @@ class CallbackWatch(Watch):
 
     Args:
         on_event: Called with each event; None to discard them.
+
+    Attributes:
+        raised: What the function has raised.
     """
 
     def __init__(self, on_event: Callable[[Event], object] | None) -> None:
         super().__init__()
         self._on_event = on_event
+        self.raised: Exception | None = None
 
     def event(self, event: Event) -> None:
         """Pass an event on."""
         if self._on_event is not None:
-            self._on_event(event)
+            try:
+                self._on_event(event)
+            except Exception as error:
+                self.raised = error
+                raise
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """As ``user_errors``, but what the function itself has raised stays what it is: it is the caller's."""
+        try:
+            with user_errors():
+                yield
+        except SplatpipeError as error:
+            if self.raised is None:
+                raise
+            raise self.raised from error
 
 
 def run_capture(
@@ -91,12 +111,13 @@ def run_capture(
     from splatpipe.pipeline.engine.config import load_preset
 
     photos, out = Path(photos).expanduser(), Path(out).expanduser()
-    with user_errors():
+    watch = CallbackWatch(on_event)
+    with watch.errors():
         given = overrides(None if config is None else Path(config).expanduser(), None, seed)
         resolved = Overrides([*given.tables, *_tables(options)]).resolve(load_preset(preset))
         again = stages_to_rerun(rerun, rerun_from, until)
         request = request_of(photos, out, resolved, device, _checked(threads))
-        run_line(request, CallbackWatch(on_event), until=until, rerun=again, wait=wait)
+        run_line(request, watch, until=until, rerun=again, wait=wait)
         return open_run(out, device=device, threads=threads)
 
 
@@ -132,12 +153,13 @@ def run_stage(
         SplatpipeError: if there is no such run or stage, an option is wrong, or the stage failed.
     """
     out = Path(out).expanduser()
-    with user_errors():
+    watch = CallbackWatch(on_event)
+    with watch.errors():
         check_stage(name)
         if shard is not None and options:
             raise UsageError("All shards of a stage have the same options.", hint="Omit either options or shard.")
         request = existing_request(out, _tables(options), device, _checked(threads))
-        run_one_stage(name, request, CallbackWatch(on_event), shard=shard, wait=wait)
+        run_one_stage(name, request, watch, shard=shard, wait=wait)
         return open_run(out, device=device, threads=threads)
 
 

@@ -83,15 +83,15 @@ class Splat:
         Raises:
             UsageError: if the splat has a place, about which its coordinates are.
         """
-        middle = np.median(centres.astype(np.float64), axis=0) if len(centres) else np.zeros(3)
-        if not FAR < np.abs(middle).max() < np.inf:
+        middle = np.median(centres, axis=0) if len(centres) else np.zeros(3)
+        taken = _origin_at(middle)
+        if not taken.any():
             return
         if self.place is not None:
             raise UsageError(
                 f"The splat lies {np.abs(middle).max():.0f} from its place.",
                 hint="Give means about its place; or coordinates in a CRS without a place, and call georeferenced.",
             )
-        taken = np.rint(middle)
         object.__setattr__(self, "means", np.ascontiguousarray(centres - taken, np.float32))
         object.__setattr__(self, "origin", tuple((np.array(self.origin) + taken).tolist()))
 
@@ -167,7 +167,7 @@ class Splat:
         origin = np.array(self.origin)
         centre = np.median(self.means, axis=0) if len(self) else np.zeros(3)
         middle = similarity.apply((origin + centre)[None])[0]
-        new = np.rint(middle) if np.abs(middle).max() > FAR else np.zeros(3)
+        new = _origin_at(middle)
         shift = similarity.apply(origin[None])[0] - new
         rotation = torch.from_numpy(np.ascontiguousarray(similarity.rotation, np.float64))
         scene = _scene(replace(self, place=None, metres=False, axes="z up"))
@@ -244,6 +244,8 @@ def write_splat(path: Path | str, splat: Splat, *, format: str | None = None) ->
         if not len(splat) or not bool(scene.gaussians.finite().all()):
             raise SplatpipeError("The splat is empty, or has numbers that are not finite.", hint="Check its arrays.")
         if format in FOLDERS:
+            if path.exists() and (not path.is_dir() or any(path.iterdir())):
+                raise UsageError(f"{path} exists already.", hint="Name a new folder, or an empty one.")
             return FOLDERS[format](path, scene)
         return write_scene(path, scene, format_of_name(path, format)).warnings()
 
@@ -259,6 +261,11 @@ def _array(values: Any, name: str) -> NDArray[Any]:
         return found if found.dtype == np.float32 else found.astype(np.float64)
     except (ValueError, TypeError, RuntimeError) as error:
         raise UsageError(f"{name} is not an array of numbers.", hint="See splatpipe.Splat.") from error
+
+
+def _origin_at(middle: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """What to take off the coordinates of a splat with this middle: whole units, zeros if it is near."""
+    return np.rint(middle) if FAR < np.abs(middle).max() < np.inf else np.zeros(3)
 
 
 def _check_axes(axes: str) -> None:

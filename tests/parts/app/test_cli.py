@@ -35,6 +35,8 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
         "print([name for name in ('torch', 'numpy', 'scipy', 'pycolmap', 'cv2', 'kornia') if name in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+    code = "import sys; from splatpipe.pipeline.app.cli import main; print('pydantic' in sys.modules)"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 
 
 @pytest.mark.parametrize(

@@ -50,12 +50,13 @@ def test_one_stage_is_run_again_with_other_options(demo_copy: Path) -> None:
     assert run.products["report.html"].stat().st_mtime >= events[0].time_s  # the report was written again
 
 
-def test_a_callback_that_raises_stops_the_run_which_can_be_resumed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("raised", [KeyError("enough"), OSError("enough")], ids=["KeyError", "OSError"])
+def test_a_callback_that_raises_stops_the_run_which_can_be_resumed(tmp_path: Path, raised: Exception) -> None:
     def stop(event: Event) -> None:
         if event.kind == "stage_finished":
-            raise KeyError("enough")
+            raise raised
 
-    with pytest.raises(KeyError, match="enough"):
+    with pytest.raises(type(raised), match="enough"):
         splatpipe.run_capture(capture_path(), tmp_path / "out", until="control", on_event=stop)
     events: list[Event] = []
     splatpipe.run_capture(capture_path(), tmp_path / "out", until="control", on_event=events.append)
