@@ -12,6 +12,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from generated_pages import write
+
 import splatpipe
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "api.md"
@@ -106,13 +108,5 @@ def _summary(node: ast.ClassDef | ast.FunctionDef) -> str:
     return f'"""{first}"""' if first else "..."
 
 
-def main() -> int:
-    """Write the page; return the exit code."""
-    before, now = PAGE.read_text(encoding="utf-8"), written()
-    PAGE.write_text(now, encoding="utf-8")
-    sys.stdout.write(f"{PAGE.name}: {'as it was' if now == before else 'written'}\n")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write({PAGE: written()}))

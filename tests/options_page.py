@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from generated_pages import write
 from pydantic.fields import FieldInfo
 
 from splatpipe.pipeline.engine.config import load_preset, lookup, option_help, preset_names, resolve
@@ -87,13 +88,5 @@ def _limits(limits: Sequence[Any]) -> Iterator[str]:
                 yield f"{words} {int(bound) if bound == int(bound) else bound:,}"
 
 
-def main() -> int:
-    """Write the page; return the exit code."""
-    before, now = PAGE.read_text(encoding="utf-8"), written()
-    PAGE.write_text(now, encoding="utf-8")
-    sys.stdout.write(f"{PAGE.name}: {'as it was' if now == before else 'written'}\n")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write({PAGE: written()}))

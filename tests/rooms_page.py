@@ -19,6 +19,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+from generated_pages import write
 from links import link_sources
 
 from splatpipe.pipeline.engine.stage import Stage
@@ -265,14 +266,5 @@ def _id(module: str) -> str:
     return f"{_name(module)}_"
 
 
-def main() -> int:
-    """Write the pages; return the exit code."""
-    for page, now in pages().items():
-        before = page.read_text(encoding="utf-8")
-        page.write_text(now, encoding="utf-8")
-        sys.stdout.write(f"{page.name}: {'as it was' if now == before else 'written'}\n")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write(pages()))
