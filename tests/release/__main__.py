@@ -34,7 +34,8 @@ TOOLS = ("c++", "cc", "g++", "gcc", "ld", "as", "ar", "ranlib", "nm", "make", "u
 VALIDATE = (
     "import sys; from cyclonedx.schema import SchemaVersion\n"
     "from cyclonedx.validation.json import JsonStrictValidator\n"
-    "sys.exit(str(JsonStrictValidator(SchemaVersion.V1_6).validate_str(open(sys.argv[1]).read()) or ''))"
+    "found = JsonStrictValidator(SchemaVersion.V1_6).validate_str(open(sys.argv[1]).read())\n"
+    "sys.exit(found and str(found))"
 )
 
 
