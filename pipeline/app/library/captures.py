@@ -116,7 +116,7 @@ def run_capture(
         given = overrides(None if config is None else Path(config).expanduser(), None, seed)
         resolved = Overrides([*given.tables, *_tables(options)]).resolve(load_preset(preset))
         again = stages_to_rerun(rerun, rerun_from, until)
-        request = request_of(photos, out, resolved, device, _checked(threads))
+        request = request_of(photos, out, resolved, device, threads)
         run_line(request, watch, until=until, rerun=again, wait=wait)
         return open_run(out, device=device, threads=threads)
 
@@ -158,7 +158,7 @@ def run_stage(
         check_stage(name)
         if shard is not None and options:
             raise UsageError("All shards of a stage have the same options.", hint="Omit either options or shard.")
-        request = existing_request(out, _tables(options), device, _checked(threads))
+        request = existing_request(out, _tables(options), device, threads)
         run_one_stage(name, request, watch, shard=shard, wait=wait)
         return open_run(out, device=device, threads=threads)
 
@@ -167,9 +167,3 @@ def _tables(options: Mapping[str, Any] | None) -> list[Table]:
     from splatpipe.pipeline.engine.config import table_of
 
     return [table_of(name, value) for name, value in (options or {}).items()]
-
-
-def _checked(threads: int) -> int:
-    if threads < 0:
-        raise UsageError(f"{threads} threads are not possible.", hint="Give a number of threads, or 0 for all cores.")
-    return threads

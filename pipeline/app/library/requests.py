@@ -60,8 +60,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     from splatpipe.stages.line import LINE
 
     began_s = round(time.monotonic() - spent_s(), 3)
-    if device not in ("auto", "cpu", "cuda"):
-        raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
+    check_machine(device, threads)
     if device == "cuda":  # reported now, not when training begins; `auto` falls back to the CPU if CUDA does not work
         from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
 
@@ -74,6 +73,13 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     machine = Machine(device, threads or available_cores(), began_s, memory_limit(config, device))
     forecast_needs = Forecaster(config, machine.threads)
     return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, forecast_needs)
+
+
+def check_machine(device: str, threads: int) -> None:
+    if device not in ("auto", "cpu", "cuda"):
+        raise UsageError(f'There is no device "{device}".', hint="Choose auto, cpu or cuda.")
+    if threads < 0:
+        raise UsageError(f"{threads} threads are not possible.", hint="Give a number of threads, or 0 for all cores.")
 
 
 def spent_s() -> float:

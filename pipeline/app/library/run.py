@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from numpy.typing import NDArray
 
+from splatpipe.pipeline.app.library.requests import check_machine
 from splatpipe.pipeline.app.library.trained_scene import in_model_frame, in_world_frame, scene_parts
 from splatpipe.pipeline.app.library.user_errors import user_errors
 from splatpipe.pipeline.engine.errors import UsageError
@@ -213,9 +214,10 @@ def open_run(out: Path | str, *, device: str = "auto", threads: int = 0) -> Run:
         threads: Threads for rendering; 0 for all cores. Does not change the image.
 
     Raises:
-        SplatpipeError: if there is no run in it.
+        SplatpipeError: if there is no run in it, or no such device or number of threads.
     """
     with user_errors():
+        check_machine(device, threads)
         return Run(open_run_folder(Path(out), LINE), device, threads)
 
 

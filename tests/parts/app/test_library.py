@@ -107,6 +107,8 @@ def test_no_run_no_stage_no_training_are_errors_with_a_hint(tmp_path: Path) -> N
     view = splatpipe.look_at((0.0, 0.0, 10.0), (0.0, 0.0, 0.0))
     calls = (
         lambda: splatpipe.open_run(tmp_path),
+        lambda: splatpipe.open_run(tmp_path / "out", device="tpu"),
+        lambda: splatpipe.open_run(tmp_path / "out", threads=-3),
         lambda: splatpipe.run_stage("trains", tmp_path / "out"),
         lambda: splatpipe.run_stage("train", tmp_path / "out", shard=1, options={"train.iterations": 1}),
         lambda: splatpipe.run_stage("train", tmp_path / "out"),
