@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from splatpipe.pipeline.geometry.equality import equal_fields
+
 
 @dataclass(frozen=True)
 class Window:
@@ -36,7 +38,7 @@ class Window:
     whole_height: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """A photo's pinhole camera and its pose.
 
@@ -61,6 +63,11 @@ class Camera:
     cy: float
     cam_from_world: Float64[np.ndarray, "4 4"]
     window: Window | None = None
+
+    def __eq__(self, other: object) -> bool:
+        return equal_fields(self, other)
+
+    __hash__ = None  # type: ignore[assignment]  # equal by their values, which include an array
 
     def centre(self) -> Float64[np.ndarray, " 3"]:
         """The projection centre in the world."""

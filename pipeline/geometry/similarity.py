@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.geometry.equality import equal_fields
+
 SIMILARITY = 7  # unknowns of a small change: a rotation vector, the log scale, the position of the points' mean
 RANK_TOLERANCE = 1e-12  # an eigenvalue below this, relative to the largest, is rounding: nothing determines its axis
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Similarity:
     """``x_target = scale * rotation @ x_source + translation``.
 
@@ -25,6 +27,11 @@ class Similarity:
     scale: float
     rotation: Float64[np.ndarray, "3 3"]
     translation: Float64[np.ndarray, " 3"]
+
+    def __eq__(self, other: object) -> bool:
+        return equal_fields(self, other)
+
+    __hash__ = None  # type: ignore[assignment]  # equal by their values, which include arrays
 
     @staticmethod
     def identity() -> Similarity:

@@ -113,6 +113,8 @@ def check_stage(name: str) -> None:
 def stages_to_rerun(rerun: Iterable[str], rerun_from: str | None, until: str | None) -> frozenset[str]:
     from splatpipe.stages.line import LINE
 
+    if isinstance(rerun, str):
+        raise UsageError(f'"{rerun}" is a text, not several stages.', hint=f'Give a list: ["{rerun}"].')
     for name in [*rerun, *filter(None, (rerun_from, until))]:
         check_stage(name)
     names = [entry.name for entry in LINE]

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, card_fault
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError, UsageError, card_fault
 
 
 @contextmanager
@@ -29,6 +29,8 @@ def known_error(error: Exception) -> SplatpipeError | None:
         return error
     if isinstance(error, OSError):
         return MachineError(str(error), "Check the free space and the permissions.")
+    if isinstance(error, ValueError) and str(error).startswith("embedded null"):
+        return UsageError("A name of a file or folder has a character 0.", hint="Give another name.")
     if isinstance(error, UnicodeEncodeError) and (sys.getfilesystemencoding() != "utf-8" or _is_undecoded(error)):
         return MachineError(
             "A name of a file or folder has letters that this environment cannot write: its encoding is "

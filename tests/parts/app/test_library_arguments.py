@@ -19,6 +19,9 @@ assert len(Splat.of_activated(means, log_scales.exp(), quats, logits.sigmoid(), 
 far = Splat([[4e5 + 0.125, 5e6, 0.0]] * 5, *trained[1:])
 assert far.means[0, 0] + far.origin[0] == 4e5 + 0.125
 assert np.isfinite(splatpipe.look_at((0, 0, 0), (0, 5, 0), up=(0, 1, 0)).cam_from_world).all()
+assert splatpipe.Similarity.identity() == splatpipe.Similarity.identity() != None
+camera = splatpipe.look_at((0, 0, 9), (0, 0, 0))
+assert camera == splatpipe.look_at((0, 0, 9), (0, 0, 0)) != splatpipe.look_at((0, 0, 8), (0, 0, 0))
 for call, said in (
     (lambda: splatpipe.look_at((0, 0, 9), (0, 0, 0), up=(0, 0, 0)), "up is not zero"),
     (lambda: splatpipe.look_at((0, 0, 9), (0, 0, float("nan"))), "finite"),
@@ -27,6 +30,9 @@ for call, said in (
     (lambda: splat.turned("sideways"), "no axes"),
     (lambda: splatpipe.read_splat("missing.ply", axes="sideways"), "no axes"),
     (lambda: splatpipe.fit_similarity(np.eye(3), np.eye(3), 1.0, max_error="x"), "max_error"),
+    (lambda: splatpipe.open_run("a\\0b"), "character 0"),
+    (lambda: splatpipe.run_capture(".", "a\\0b"), "character 0"),
+    (lambda: splatpipe.run_capture(".", "out", rerun="train"), "not several stages"),
 ):
     try:
         call()
