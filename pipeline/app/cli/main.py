@@ -318,8 +318,8 @@ def status(out: OutArgument, as_json: JsonOption = False) -> None:
 
 @with_help(app)
 def report(out: OutArgument, as_json: JsonOption = False) -> None:
-    """Write OUT/report.html again from the existing results."""
-    from splatpipe.pipeline.app.report import make_report
+    """Write OUT/report.html and OUT/report.pdf again from the existing results."""
+    from splatpipe.pipeline.app.report import PDF_FILE, make_report
     from splatpipe.pipeline.app.terminal.console import print_line
     from splatpipe.pipeline.engine.runs.run_folder import LOG_FILE, open_run_folder
     from splatpipe.stages.line import LINE
@@ -327,8 +327,10 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
     with CommandSummary(out, as_json) as done:
         open_run_folder(out, LINE)
         path = make_report(out, out / LOG_FILE)
-        done.details = {"outputs": [str(path)]}
-    print_line(str(path))
+        paths = [str(path), str(out / PDF_FILE)]
+        done.details = {"outputs": paths}
+    for each in paths:
+        print_line(each)
 
 
 @with_help(app)

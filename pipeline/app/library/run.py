@@ -28,7 +28,7 @@ from splatpipe.stages.line import EXPORT, GEOREF, LINE, UNDISTORT
 if TYPE_CHECKING:
     from splatpipe.pipeline.film.filming import TrainedScene
 
-METRICS, GEOREFERENCE, REPORT = "metrics.json", "georef.json", "report.html"
+METRICS, GEOREFERENCE, REPORTS = "metrics.json", "georef.json", ("report.html", "report.pdf")
 Vector = Sequence[float] | NDArray[Any]
 What = Literal["colour", "depth", "normals"]
 
@@ -147,7 +147,7 @@ class Run:
     @property
     def products(self) -> dict[str, Path]:
         """The files for people in OUT, by their names there, e.g. ``splat.ply`` and ``report.html``."""
-        names = [*self._folder.deliverables(), REPORT]
+        names = [*self._folder.deliverables(), *REPORTS]
         return {name: self.out / name for name in names if (self.out / name).is_file()}
 
     def render(self, camera: Camera, what: What = "colour") -> Render:

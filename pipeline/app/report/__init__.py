@@ -1,4 +1,4 @@
-"""The report of a run: one page for the client, built from events and manifests.
+"""The report of a run: one page for the client, and a short PDF, built from events and manifests.
 
 `write_report` writes it in this process; `make_report`, which the commands use, in a separate one: an error or crash
 there can neither fail a good run nor delay its end, and the command need not load its libraries.
@@ -20,6 +20,7 @@ from splatpipe.pipeline.engine.heap import imports_outside_gc
 from splatpipe.pipeline.engine.python_module import python_module
 
 REPORT_FILE = "report.html"
+PDF_FILE = "report.pdf"
 HEAD_BYTES = 4096  # beginning of the page, which contains the digest of its results
 TIMEOUT_S = 600.0  # far more than hundreds of photos take
 MIN_S = 2.0  # minimum time granted: enough for the report without images, even on a busy machine
@@ -27,30 +28,37 @@ POLL_S = 0.02
 
 
 def write_report(out: Path, *, drawn: bool = True) -> Path:
-    """Write OUT/report.html atomically.
+    """Write OUT/report.html and, with images, OUT/report.pdf, each atomically.
 
     Args:
         out: The run's folder; the run may be finished, stopped, failed, or still running.
-        drawn: Whether to include charts and images.
+        drawn: Whether to include charts and images; without them there is no PDF.
 
     Returns:
-        Its path.
+        The page's path.
 
     Raises:
         OSError: if it cannot be written.
         MachineError: if this installation lacks the page's script or style.
+        RuntimeError: if the PDF cannot be set; the page is there.
     """
     with imports_outside_gc():
         from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
-        from splatpipe.pipeline.app.report.page import report_page
+        from splatpipe.pipeline.app.report.page import report_content, report_page, run_labels
 
-    path = out / REPORT_FILE
-    write_durably(path, report_page(read_report_inputs(out), drawn=drawn))
-    return path
+    inputs = read_report_inputs(out)
+    content = report_content(inputs, drawn=drawn)
+    (out / PDF_FILE).unlink(missing_ok=True)  # an earlier run's must not lie beside this page
+    write_durably(out / REPORT_FILE, report_page(inputs, content))
+    if drawn:
+        from splatpipe.pipeline.app.report.pdf import report_pdf
+
+        write_durably(out / PDF_FILE, report_pdf(content, run_labels(inputs)))
+    return out / REPORT_FILE
 
 
 def is_current(out: Path) -> bool:
-    """Whether OUT/report.html is the full report of a finished run's present results, so that another would be alike.
+    """Whether OUT has the full report of a finished run's present results, so that another would be alike.
 
     Args:
         out: The run's folder.
@@ -63,11 +71,12 @@ def is_current(out: Path) -> bool:
         digest = results_digest(read_report_inputs(out))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, SplatpipeError):
         return False
-    return bool(digest) and f'<meta name="splatpipe-results" content="{digest}">'.encode() in head
+    is_whole = bool(digest) and (out / PDF_FILE).is_file()  # written last
+    return is_whole and f'<meta name="splatpipe-results" content="{digest}">'.encode() in head
 
 
 def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
-    """Write OUT/report.html in a separate process.
+    """Write OUT/report.html and OUT/report.pdf in a separate process.
 
     Args:
         out: The run's folder.
@@ -76,7 +85,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
             if there is no time for the full one. None: no limit.
 
     Returns:
-        Its path.
+        The page's path.
 
     Raises:
         MachineError: if it could not be written.
@@ -114,7 +123,8 @@ def _run(command: Sequence[str], log: IO[bytes], over: Callable[[], bool], out: 
     finally:
         process.kill()
         code = process.wait()
-        remove_unfinished(out, REPORT_FILE, process.pid)
+        for name in (REPORT_FILE, PDF_FILE):
+            remove_unfinished(out, name, process.pid)
     return code
 
 

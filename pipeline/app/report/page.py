@@ -1,9 +1,9 @@
-"""Assembles the report: the chapters for which there is data, one template, one file."""
+"""Assembles the report: the chapters for which there is data, and the page made from them."""
 
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,27 +25,47 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 
 
-def report_page(inputs: ReportInputs, *, drawn: bool) -> str:
-    """The report as one self-contained HTML text.
+def report_content(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
+    """What a report says: the values for the template of the page, and for that of the PDF.
 
     Args:
         inputs: The report's inputs.
         drawn: Whether to include charts and images; without them it is quick.
-
-    Raises:
-        MachineError: if this installation lacks the page's script or style.
     """
     if not drawn:
-        return _render(inputs, None, None, drawn=False)
+        return _content(inputs, None, None, drawn=False)
     from splatpipe.pipeline.app.report.charts.drawing import styled
 
     geometry, trouble = _geometry(inputs)
     with styled():
-        return _render(inputs, geometry, trouble, drawn=True)
+        return _content(inputs, geometry, trouble, drawn=True)
 
 
-def _render(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> str:
-    chapters = {
+def report_page(inputs: ReportInputs, content: Mapping[str, Any]) -> str:
+    """The report as one self-contained HTML text.
+
+    Args:
+        inputs: The report's inputs.
+        content: Its content.
+
+    Raises:
+        MachineError: if this installation lacks the page's script or style.
+    """
+    places = run_labels(inputs)
+    return page_text(TEMPLATES, "report.html.j2", places, style="report.css", script="report.js", **content)
+
+
+def _content(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> dict[str, Any]:
+    return {
+        "name": inputs.out.resolve().name or str(inputs.out),
+        "photos_dir": "" if inputs.photos_dir is None else inputs.photos_dir.name,
+        "began": moment(inputs.history.began_s) if inputs.history.began_s else "",
+        "version": importlib.metadata.version("splatpipe"),
+        "verdict": judge(inputs),
+        "key_figures": _guarded(lambda: {"cards": _cards(inputs)}),
+        "drawn": drawn,
+        "results": results_digest(inputs) if drawn else "",
+        "geometry_trouble": trouble,
         "capture": _guarded(lambda: capture_chapter(inputs, geometry, drawn=drawn) if _checked(inputs) else None),
         "registration": _guarded(
             lambda: registration_chapter(inputs, geometry, drawn=drawn) if _matched(inputs) else None
@@ -58,26 +78,10 @@ def _render(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None
         "files": _guarded(lambda: files_chapter(inputs)),
         "messages": _guarded(lambda: messages_chapter(inputs)),
     }
-    return page_text(
-        TEMPLATES,
-        "report.html.j2",
-        _places(inputs),
-        style="report.css",
-        script="report.js",
-        name=inputs.out.resolve().name or str(inputs.out),
-        photos_dir="" if inputs.photos_dir is None else inputs.photos_dir.name,
-        began=moment(inputs.history.began_s) if inputs.history.began_s else "",
-        version=importlib.metadata.version("splatpipe"),
-        verdict=judge(inputs),
-        key_figures=_guarded(lambda: {"cards": _cards(inputs)}),
-        drawn=drawn,
-        results=results_digest(inputs) if drawn else "",
-        geometry_trouble=trouble,
-        **chapters,
-    )
 
 
-def _places(inputs: ReportInputs) -> PathLabels:
+def run_labels(inputs: ReportInputs) -> PathLabels:
+    """The labels that replace this machine's folders in a report."""
     options = {} if inputs.config is None else inputs.config.model_dump(mode="json")
     return PathLabels.of(inputs.out, inputs.photos_dir, options)
 

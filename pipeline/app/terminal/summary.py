@@ -128,11 +128,14 @@ class CommandSummary:
             show_bad_cameras(outcome.artifacts["sparse"].summary.get("verdict") or {})
 
     def _files(self, outcome: Outcome) -> list[Path]:
+        from splatpipe.pipeline.app.report import PDF_FILE
         from splatpipe.stages.line import LINE
 
         made = [(stage, outcome.artifacts[stage.name]) for stage in LINE if stage.name in outcome.artifacts]
         files = [self._out / name for stage, artifact in made for name in artifact.deliverables(stage)]
-        return [path for path in [*files, *filter(None, [self.watch.report])] if path.is_file()]
+        page = self.watch.report
+        reports = [] if page is None else [page, page.with_name(PDF_FILE)]
+        return [path for path in [*files, *reports] if path.is_file()]
 
     def _as_object(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
         outcome = self.watch.outcome

@@ -14,11 +14,12 @@ from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE
 
-REPORT = "report.html"  # the only file for people in OUT that no stage delivers
+REPORT, REPORT_PDF = "report.html", "report.pdf"  # the only files for people in OUT that no stage delivers
 VIEWER = "viewer.html"
 MAX_METRICS_BYTES = 4 << 20  # half a kilobyte for each of 8,000 views; parsed for each request, while others wait
 WHAT = {
     REPORT: "what was done, and the quality of the result",
+    REPORT_PDF: "the same in short, for the client",
     VIEWER: "the splat in 3D, in a single page",
     SITE_PAGE: "the splat in 3D, with levels of detail: put the folder web/ on any web host",
     "splat.ply": "the splat, for any viewer of Gaussian splats",
@@ -30,12 +31,12 @@ WHAT = {
     "sparse.glb": "sparse points and camera frusta",
     "flythrough.webm": "a flight through the scene",
 }
-BROWSER_SUFFIXES = (".html", ".json", ".mp4", ".webm", ".png", ".jpg")
+BROWSER_SUFFIXES = (".html", ".json", ".pdf", ".mp4", ".webm", ".png", ".jpg")
 
 
 def downloadable_files(run: RunFolder) -> tuple[str, ...]:
     """The files that may be fetched, relative to OUT: the report and the stages' deliverables."""
-    return tuple(name for name in (REPORT, *run.deliverables()) if is_inside(run.out, name))
+    return tuple(name for name in (REPORT, REPORT_PDF, *run.deliverables()) if is_inside(run.out, name))
 
 
 def landing(run: RunFolder, marking: bool) -> dict[str, Any]:
