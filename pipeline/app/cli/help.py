@@ -117,7 +117,7 @@ PAGES = {
         "docs/stages.md",
     ),
     "report": HelpPage(
-        "Reads OUT and writes report.html and report.pdf into it. A run does so by itself; this is for one that was stopped.",
+        "Writes report.html and report.pdf into OUT. A run does so by itself; this is for one that was stopped.",
         ("report OUT",),
         "docs/products.md",
     ),

@@ -25,7 +25,7 @@ from splatpipe.pipeline.app.report.chapters.capture import unit_of
 from splatpipe.pipeline.app.report.chapters.georeferencing import georeferencing_chapter
 from splatpipe.pipeline.app.report.charts.pictures import CROP_SIDE_PX, MAX_CROPS, chosen_views, cut_crops
 from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
-from splatpipe.pipeline.app.report.page import report_page
+from splatpipe.pipeline.app.report.page import report_content, report_page
 from splatpipe.pipeline.app.report.verdict import judge
 from splatpipe.pipeline.app.terminal.console import show_bad_cameras
 
@@ -41,6 +41,11 @@ def finished(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def copy_of_run(demo_run: Path, tmp_path: Path) -> Path:
     return linked_copy(demo_run, tmp_path / "out")
+
+
+def undrawn_page(out: Path) -> str:
+    inputs = read_report_inputs(out)
+    return report_page(inputs, report_content(inputs, drawn=False))
 
 
 def test_its_ids_are_unique(finished: Path) -> None:
@@ -84,7 +89,7 @@ def test_a_report_of_the_same_results_is_current_until_one_changes(copy_of_run: 
 
 def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_of_run: Path) -> None:
     (copy_of_run / "report.html").unlink()
-    page = report_page(read_report_inputs(copy_of_run), drawn=False)
+    page = undrawn_page(copy_of_run)
     assert "splatpipe report writes the page again" in page and "<svg role=" not in page and "data:image" not in page
     make_report(copy_of_run, copy_of_run / "splatpipe.log", until_s=time.monotonic() + 600.0)
     assert "<svg role=" in (copy_of_run / "report.html").read_text()
@@ -102,7 +107,7 @@ def test_a_stop_leaves_the_plain_report_when_there_is_no_time_for_pictures(copy_
 def test_a_damaged_part_costs_only_its_chapter_of_the_report(copy_of_run: Path, part: str) -> None:
     path = read_report_inputs(copy_of_run).part(part)
     write_apart(path, "[" + " " * (path.stat().st_size - 2) + "]")  # other content of unchanged length
-    page = report_page(read_report_inputs(copy_of_run), drawn=False)
+    page = undrawn_page(copy_of_run)
     assert page.count("This part could not be read") == 1
     assert "Processing</h2>" in page
 
@@ -221,7 +226,7 @@ def test_bad_cameras_are_the_headline_of_page_and_console(
 
 
 def test_the_page_lists_the_mappers_that_were_tried(copy_of_run: Path) -> None:
-    page = report_page(read_report_inputs(copy_of_run), drawn=False)
+    page = undrawn_page(copy_of_run)
     table = page[page.index("Mapping methods tried") : page.index("Calibration</h3>")]
     assert "incremental" in table and "taken" in table and "nan" not in table
 
@@ -230,10 +235,10 @@ def test_an_interrupted_run_is_distinguished_from_a_running_one(copy_of_run: Pat
     lines = (copy_of_run / "events.jsonl").read_text().splitlines()
     started = next(i for i, line in enumerate(lines) if '"stage_started"' in line and '"train"' in line)
     (copy_of_run / "events.jsonl").write_text("\n".join(lines[: started + 4]))
-    assert "Interrupted in train" in report_page(read_report_inputs(copy_of_run), drawn=False)
+    assert "Interrupted in train" in undrawn_page(copy_of_run)
     with (copy_of_run / "stages" / ".lock").open("rb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert "Still running in train" in report_page(read_report_inputs(copy_of_run), drawn=False)
+        assert "Still running in train" in undrawn_page(copy_of_run)
 
 
 def test_a_report_that_cannot_be_written_does_not_spoil_a_good_run(copy_of_run: Path) -> None:
@@ -274,7 +279,7 @@ def test_no_folder_outside_out_is_named(copy_of_run: Path) -> None:
     warning = {"kind": "warning", "stage": "georef", "data": {"message": message, "hint": message}, "time_s": 1e9}
     with (copy_of_run / "events.jsonl").open("a") as log:
         log.write(json.dumps(warning) + "\n")
-    page = report_page(read_report_inputs(copy_of_run), drawn=False)
+    page = undrawn_page(copy_of_run)
     assert "PHOTOS/a.jpg and OUT/x and points 2.csv and y and z" in page
     for folder in ("jane", "customers", "Brown", "/srv", str(copy_of_run.parent), f"{Path.home()}/"):
         assert folder not in page

@@ -1,4 +1,4 @@
-"""The report as PDF: the page's figures, a few pages, the same bytes; and no text of a run that could set it otherwise."""
+"""The report as PDF: the page's figures, a few pages, the same bytes; texts of the run cannot be markup."""
 
 from __future__ import annotations
 
