@@ -53,7 +53,8 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
     if drawn:
         from splatpipe.pipeline.app.report.pdf import report_pdf
 
-        write_durably(out / PDF_FILE, report_pdf(content, run_labels(inputs)))
+        pdf = report_pdf(content, run_labels(inputs))
+        write_durably(out / PDF_FILE, lambda file: file.write(pdf))
     return out / REPORT_FILE
 
 

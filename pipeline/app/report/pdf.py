@@ -60,8 +60,10 @@ def report_pdf(content: Mapping[str, Any], places: PathLabels) -> bytes:
         folder = Path(name)
         values = _Files(folder, places).plain(shortened(content))
         (folder / "report.json").write_text(json.dumps(values), encoding="utf-8")
-        fonts = [Path(get_data_path()) / "fonts" / "ttf"]
-        compiler = typst.Compiler(TEMPLATE.read_bytes(), folder, fonts, ignore_system_fonts=True)
+        template = folder / TEMPLATE.name
+        template.write_bytes(TEMPLATE.read_bytes())
+        fonts = [str(Path(get_data_path()) / "fonts" / "ttf")]
+        compiler = typst.Compiler(str(template), str(folder), fonts, ignore_system_fonts=True)
         pdf = compiler.compile(format="pdf")
     assert isinstance(pdf, bytes)
     return pdf
