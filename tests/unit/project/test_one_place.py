@@ -11,7 +11,10 @@ COPIES = ("model", "reconstruction", "self.model")  # names of models in memory
 def calls(name: str) -> Iterator[tuple[str, ast.Call]]:
     """Calls of a function like ``module.function``, and the files they are in."""
     for path in sorted([*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/**/*.py")]):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        if not all(word in text for word in name.split(".")):
+            continue  # cannot call it, and needs no parsing
+        for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == name:
                 yield str(path.relative_to(ROOT)), node
 
