@@ -2,6 +2,7 @@
 
 import fcntl
 import gc
+import importlib
 import importlib.util
 import os
 import shutil
@@ -13,10 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import checked_on_call
-import kornia  # noqa: F401
-import pycolmap  # noqa: F401
 import pytest
-import torch  # noqa: F401
 from finished_run import folder_digest, linked_copy
 from jaxtyping import install_import_hook
 from playwright.sync_api import Browser, Page, sync_playwright
@@ -54,17 +52,28 @@ def _modules_with_shapes() -> Iterator[str]:
                 yield ".".join(["splatpipe", folder.name, *(part for part in inside if part != "__init__")])
 
 
-# Tests check these annotations. All other modules are left to mypy: to instrument them, too, doubles the import time.
-# Libraries are imported before: from within an instrumented module, they would be compiled again.
-checked_on_call.install()
-install_import_hook(list(_modules_with_shapes()), "beartype.beartype")
+def _check_shapes() -> None:
+    """Let tests check the annotations of arrays when a module of ours is imported.
+
+    All other modules are left to mypy: to instrument them, too, doubles the import time. Libraries are imported before:
+    from within an instrumented module, they would be compiled again.
+    """
+    for library in ("kornia", "pycolmap", "torch"):
+        importlib.import_module(library)
+    checked_on_call.install()
+    install_import_hook(list(_modules_with_shapes()), "beartype.beartype")
 
 
-def pytest_configure() -> None:
-    """Restore Ctrl-C: background test runs ignore SIGINT, and so would all their children."""
+def pytest_configure(config: pytest.Config) -> None:
+    """Restore Ctrl-C, and check shapes, but not in the process that only hands tests to workers.
+
+    Background test runs ignore SIGINT, and so would all their children.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if WORKER in os.environ:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: the other cores belong to other workers
+    if WORKER in os.environ or not config.getoption("numprocesses", None):
+        _check_shapes()
 
 
 @pytest.hookimpl(wrapper=True)
