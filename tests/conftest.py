@@ -65,14 +65,15 @@ def _check_shapes() -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Restore Ctrl-C, and check shapes, but not in the process that only hands tests to workers.
+    """Restore Ctrl-C, and check shapes where tests run: not in the process that only hands them to workers.
 
-    Background test runs ignore SIGINT, and so would all their children.
+    Background test runs ignore SIGINT, and so would all their children. Workers inherit the number of threads before
+    they load a library: the other cores belong to other workers, and threads that wait for them cost CPU time as well.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    if WORKER in os.environ:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: the other cores belong to other workers
-    if WORKER in os.environ or not config.getoption("numprocesses", None):
+    if config.getoption("numprocesses", None):
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+    else:
         _check_shapes()
 
 
