@@ -1,4 +1,6 @@
-"""The order of the tests of parts: nobody waits for the finished run while there is something else to do."""
+"""The order of the tests of parts, and commands that nobody asks for a whole report."""
+
+from collections.abc import Iterator
 
 import pytest
 
@@ -10,3 +12,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     needing = list(dict.fromkeys(item.path for item in items if "demo_run" in getattr(item, "fixturenames", ())))
     items.sort(key=lambda item: 0 if item.path in needing[:1] else 1 + (item.path in needing))
+
+
+@pytest.fixture
+def plain_reports() -> Iterator[None]:
+    """Let the commands of a test write their reports without pictures: others look at these."""
+    import command  # not before arrays are checked where they are used
+
+    with command.plain_reports():
+        yield

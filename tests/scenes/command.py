@@ -13,6 +13,9 @@ from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
 
+import pytest
+
+from splatpipe.pipeline.app import report
 from splatpipe.pipeline.app.cli.main import main
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -41,6 +44,18 @@ def answered(*arguments: object) -> dict[str, Any]:
 def ran(answer: dict[str, Any]) -> list[str]:
     """Return the names of the stages that a command ran, in order; others were reused."""
     return [stage["name"] for stage in answer["stages"] if stage["state"] == "ran"]
+
+
+@contextlib.contextmanager
+def plain_reports() -> Iterator[None]:
+    """Let commands write their reports without pictures and in this process: for tests that do not look at them."""
+
+    def plain(out: Path, log: Path, *, until_s: float | None = None) -> Path:
+        return report.write_report(out, drawn=False)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "make_report", plain)
+        yield
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from command import answered
+from command import answered, plain_reports
 from finished_run import linked_copy
 
 from splatpipe.demo import CAPTURE, capture_path
@@ -30,8 +30,9 @@ def by_gps_alone(demo_run: Path, home: Path) -> Path:
     )
     (out / "config.toml").unlink()
     (out / "config.toml").write_text(config)
-    for stage in ("control", "targets", "georef"):
-        answered("stage", stage, out, "--set", "georef.control=none", "--set", "export.viewer_megabytes=0.0")
+    with plain_reports():
+        for stage in ("control", "targets", "georef"):
+            answered("stage", stage, out, "--set", "georef.control=none", "--set", "export.viewer_megabytes=0.0")
     return out
 
 

@@ -88,6 +88,7 @@ def test_an_invalid_call_gets_one_message_and_its_exit_code(
     assert not (tmp_path / "out" / "splat.ply").exists()
 
 
+@pytest.mark.usefixtures("plain_reports")
 def test_json_is_one_object_on_stdout_even_on_failure(tmp_path: Path, photos: Path) -> None:
     done = splatpipe("run", photos, tmp_path / "out", "--json")
     assert done.returncode == 1

@@ -22,6 +22,7 @@ def splatpipe(*arguments: str) -> tuple[int, dict[str, Any]]:
     return done.returncode, json.loads(done.stdout)
 
 
+@pytest.mark.usefixtures("plain_reports")
 def test_a_finished_run_is_exported_in_more_formats_and_keeps_earlier_ones(demo_copy: Path) -> None:
     out = demo_copy
     before = (out / "splat.ply").read_bytes()

@@ -21,6 +21,8 @@ from splatpipe.pipeline.app.renders import RenderRequest, render_run
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE
 
+pytestmark = pytest.mark.usefixtures("plain_reports")  # what scripts call in processes of their own writes whole ones
+
 UNCHANGED = ("splat.ply", "metrics.json", "cameras.json", "georef.json")
 
 

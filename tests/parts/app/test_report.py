@@ -244,7 +244,7 @@ def test_an_interrupted_run_is_distinguished_from_a_running_one(copy_of_run: Pat
 def test_a_report_that_cannot_be_written_does_not_spoil_a_good_run(copy_of_run: Path) -> None:
     (copy_of_run / "report.html").unlink()
     (copy_of_run / "report.html").mkdir()
-    done = splatpipe("stage", "export", copy_of_run, "--json")
+    done = splatpipe("stage", "split", copy_of_run, "--json")
     assert done.returncode == 0 and "The report could not be written" in done.stderr
     assert json.loads(done.stdout)["error"] is None
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import rasterio
-from command import splatpipe
+from command import plain_reports, splatpipe
 from finished_run import write_apart
 
 from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measurement_lines
@@ -60,12 +60,14 @@ def test_a_finished_run_is_cut_and_measured(demo_copy: Path, tmp_path: Path) -> 
         return {path.name: path.read_bytes() for path in [*(out / "sections").iterdir(), out / "viewer.html"]}
 
     before = files()
-    code, output = surface(out, "--section", line, "--section", "0,0,10,10")
+    with plain_reports():  # the page was looked at
+        code, output = surface(out, "--section", line, "--section", "0,0,10,10")
     assert code == 1
     assert "does not cross" in output["error"]["message"]
     assert files() == before  # nothing is half done
     (out / "sections/notes.txt").write_text("mine")
-    assert surface(out, "--section", f"{x},{y},{x},{y + 5.0}")[0] == 0
+    with plain_reports():
+        assert surface(out, "--section", f"{x},{y},{x},{y + 5.0}")[0] == 0
     after = files()
     assert "section-2.csv" not in after
     assert after.keys() > {"section-1.csv", "section-1.png", "notes.txt"}

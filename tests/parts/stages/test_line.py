@@ -70,11 +70,13 @@ def test_a_second_run_does_nothing(demo_options: list[str], demo_copy: Path) -> 
     assert sha256(demo_copy / "splat.ply") == before
 
 
+@pytest.mark.usefixtures("plain_reports")
 def test_changed_option_reruns_only_downstream(demo_options: list[str], demo_copy: Path) -> None:
     changed = (*demo_options, *sets("train.iterations=40"), "--until", "evaluate")
     assert ran(answered("run", capture_path(), demo_copy, *changed)) == ["blocks", "train", "clean", "evaluate"]
 
 
+@pytest.mark.usefixtures("plain_reports")
 def test_one_stage_runs_alone(demo_copy: Path) -> None:
     assert ran(answered("stage", "evaluate", demo_copy)) == ["evaluate"]
 
