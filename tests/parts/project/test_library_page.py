@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import io
 import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -72,7 +75,17 @@ def write_foreign(path: Path, splat: splatpipe.Splat) -> None:
 
 
 def run_example(title: str, folder: Path) -> str:
-    """Run an example as a script of its own; return what it printed."""
+    """Run an example as a script, in this process; return what it printed."""
+    (folder / "example.py").write_text(examples()[title], encoding="utf-8")
+    printed, warned = io.StringIO(), io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed), contextlib.redirect_stderr(warned):
+        runpy.run_path("example.py", run_name="__main__")
+    assert warned.getvalue() == ""
+    return printed.getvalue()
+
+
+def run_script(title: str, folder: Path) -> str:
+    """Run an example in a process of its own; return what it printed."""
     (folder / "example.py").write_text(examples()[title], encoding="utf-8")
     done = subprocess.run([sys.executable, "example.py"], cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -98,7 +111,7 @@ def test_a_finished_run_is_rendered_from_a_new_view(folder: Path) -> None:
 
 
 def test_a_batch_shows_its_progress_and_survives_a_bad_capture(folder: Path) -> None:
-    printed = run_example("A batch with a progress callback", folder)
+    printed = run_script("A batch with a progress callback", folder)
     assert re.search(r"^empty: \S.*\.$", printed, re.MULTILINE)
     assert f"house: 40 of 40 photos, {folder.resolve()}/out/house/report.html\n" in printed
 

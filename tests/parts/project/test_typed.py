@@ -48,20 +48,15 @@ def user_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return environment / "bin" / "python"
 
 
-def mypy(python: Path, folder: Path, text: str) -> subprocess.CompletedProcess[str]:
-    (folder / "mine.py").write_text(text)
-    how = ["--strict", "--config-file=", "--python-executable", str(python)]
-    command = [sys.executable, "-m", "mypy", *how, "mine.py"]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-
-
-def test_a_users_mypy_finds_splatpipe_and_its_modules(user_python: Path, tmp_path: Path) -> None:
-    done = mypy(user_python, tmp_path, GOOD)
-    assert done.returncode == 0, done.stdout
-
-
-def test_a_users_mypy_notices_a_wrong_use(user_python: Path, tmp_path: Path) -> None:
-    done = mypy(user_python, tmp_path, BAD)
+def test_a_users_mypy_finds_splatpipe_and_its_modules_and_notices_a_wrong_use(
+    user_python: Path, tmp_path: Path
+) -> None:
+    for name, text in (("good.py", GOOD), ("bad.py", BAD)):
+        (tmp_path / name).write_text(text)
+    how = ["--strict", "--config-file=", "--python-executable", str(user_python)]
+    command = [sys.executable, "-m", "mypy", *how, "good.py", "bad.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert {line.partition(":")[0] for line in done.stdout.splitlines() if ": error: " in line} == {"bad.py"}
     assert 'expression has type "float", variable has type "str"' in done.stdout
     assert 'expression has type "Run", variable has type "str"' in done.stdout
 

@@ -235,8 +235,14 @@ class Kill(BaseException):
     """Stands in for a kill."""
 
 
+@pytest.fixture(scope="module")
+def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The digest of a training that nothing disturbed."""
+    return trained(scene, tmp_path_factory.mktemp("undisturbed"))[0]
+
+
 @pytest.mark.parametrize("when", [2, 25])
-def test_killed_training_resumes_with_the_same_bits(scene: Path, tmp_path: Path, when: int) -> None:
+def test_killed_training_resumes_with_the_same_bits(scene: Path, undisturbed: str, tmp_path: Path, when: int) -> None:
     step = shortage.iterate
 
     def dying(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto) -> None:
@@ -251,7 +257,7 @@ def test_killed_training_resumes_with_the_same_bits(scene: Path, tmp_path: Path,
         trained(scene, tmp_path / "killed")
     digest, recorder = trained(scene, tmp_path / "killed", threads=2)
     assert not recorder.warnings
-    assert digest == trained(scene, tmp_path / "whole")[0]
+    assert digest == undisturbed
 
 
 def test_checkpoint_without_its_sky_is_reported_and_the_training_starts_again(scene: Path, tmp_path: Path) -> None:
