@@ -165,8 +165,8 @@ def demo_run(demo_options: list[str], tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture
 def demo_copy(demo_run: Path, tmp_path: Path) -> Path:
-    """A copy of ``demo_run`` that a test may continue."""
-    return linked_copy(demo_run, tmp_path / "out")
+    """A copy of ``demo_run`` that a test may continue, of the same name: reports state it, and stay valid."""
+    return linked_copy(demo_run, tmp_path / demo_run.name)
 
 
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -18,7 +18,7 @@ from splatpipe.pipeline.raster.isa import _native
 from splatpipe.pipeline.raster.rasterization import rasterization
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
-VIEWS, STEPS, START = 8, 2000, 120
+VIEWS, STEPS, START = 8, 700, 120
 RATES = {"means": 2e-3, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh": 5e-3}
 MODES: dict[str, Any] = {"sh_degree": 1, "rasterize_mode": "antialiased"}
 SSIM_SHARE = 0.2
@@ -106,7 +106,13 @@ def test_gsplats_strategy_clones_splits_and_prunes_on_our_rasterization(capsys: 
     params = parameters(generator)
     optimizers = {name: FusedAdam([params[name]], lr=rate, eps=1e-15) for name, rate in RATES.items()}
     strategy = CountingStrategy(
-        grow_grad2d=0.002, grow_scale3d=0.05, refine_start_iter=200, refine_stop_iter=1400, reset_every=900
+        prune_opa=0.02,
+        grow_grad2d=0.002,
+        grow_scale3d=0.05,
+        refine_start_iter=70,
+        refine_stop_iter=490,
+        refine_every=35,
+        reset_every=315,
     )
     strategy.check_sanity(params, optimizers)
     state, begun, losses = strategy.initialize_state(scene_scale=2.0), time.perf_counter(), []
