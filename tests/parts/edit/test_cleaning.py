@@ -78,12 +78,17 @@ def cameras() -> list[Camera]:
 def photos(pictures: bool) -> TrainingPhotos:
     """Return photos of the original scene."""
 
-    def picture(index: int) -> tuple[Pixels, Mask | None]:
-        with torch.no_grad():
-            colour = rasterizer.render(scene(), cameras()[index], OPTIONS).colour
-        return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).numpy().astype(np.uint8), None
-
     return TrainingPhotos(cameras(), OPTIONS, picture if pictures else None)
+
+
+@cache
+def picture(index: int) -> tuple[Pixels, Mask | None]:
+    """Return what a camera sees of the original scene."""
+    with torch.no_grad():
+        colour = rasterizer.render(scene(), cameras()[index], OPTIONS).colour
+    pixels = (colour.clamp(0.0, 1.0) * 255.0 + 0.5).numpy().astype(np.uint8)
+    pixels.flags.writeable = False
+    return pixels, None
 
 
 def planted(kind: str) -> Gaussians:
