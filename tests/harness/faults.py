@@ -136,7 +136,7 @@ FAULTS = (
     ),
     KernelFault(
         "no barrier of the grid before the lists that nobody foresaw are blended",
-        "cuda/frame.cu",
+        "cuda/bin.cuh",
         "scatter_digits(tile_pass(job.at, pass));\n    }\n    sync_grid();",
         "scatter_digits(tile_pass(job.at, pass));\n    }\n    if (!FAULT) sync_grid();",
     ),
