@@ -18,7 +18,7 @@ from repository import HARNESS
 
 
 def ending() -> FeatureCase:
-    """More translucent Gaussians in a tile than a batch, then walls, behind which nothing counts; groups of channels."""
+    """More translucent Gaussians in a tile than a batch, then walls that hide all others; many channels."""
     case = feature_case(2, 700, 33, (30, 17), compensate=True, alpha_max=0.87, options=(1e10, 0.3, 0.0, 0.9, 0.0))
     rows = {name: values.copy() for name, values in case.rows.items()}
     rows["means"] = ((rows["means"] - [0.0, 0.0, 4.0]) * [0.2, 0.2, 0.4] + [0.0, 0.0, 4.0]).astype(np.float32)
