@@ -70,6 +70,11 @@ def smoke(count: int = SMOKE_COUNT, size: tuple[int, int] = SMOKE_SIZE) -> Itera
             raise SystemExit("the first render or its gradients differ from the CPU's")
 
 
+def relative(ours: Tensor, expected: Tensor) -> float:
+    """Return the difference relative to the norm of what is expected."""
+    return float((ours - expected).norm() / expected.norm())
+
+
 def view_of(width: int, height: int) -> Camera:
     """Return a camera at the origin."""
     return Camera("smoke", width, height, 0.8 * width, 0.81 * width, width / 2 + 2.5, height / 2 - 1.0, np.eye(4))
@@ -149,11 +154,7 @@ def compared(model: Gaussians, camera: Camera, photo: Tensor, where: torch.devic
     there = _gradients(model, camera, photo, where)
     with cuda.use_kernels(None):
         here = _gradients(model, camera, photo, torch.device("cpu"))
-    gradients = {
-        name: float((there[name] - value).norm() / value.norm())
-        for name, value in here.items()
-        if name not in ("colour", "loss")
-    }
+    gradients = {name: relative(there[name], value) for name, value in here.items() if name not in ("colour", "loss")}
     return {
         "psnr_db": float(metrics.psnr(there["colour"], here["colour"])),
         "largest": float((there["colour"] - here["colour"]).abs().max()),

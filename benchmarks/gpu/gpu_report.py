@@ -94,6 +94,8 @@ def verdicts(record: VisitRecord) -> Iterator[Verdict]:
     yield passed(record, "tests marked cuda", "the tests on the device pass")
     for tool in CHECKS:
         yield passed(record, tool, f"{tool} finds nothing")
+    same = [row["same"] for row in record.of("features")]
+    yield judged("features have the same bits from run to run", same, bool, "{}", min)
     for peer, goal in GOALS.items():
         for ours, theirs in pairs(record, peer):
             factor = theirs["iteration_ms"] / ours["iteration_ms"]
@@ -192,6 +194,17 @@ def tables(record: VisitRecord) -> Iterator[str]:
         ],
     )
     yield from table(
+        ("rasterization", "Gaussians", "forward", "both passes", "gsplat's both passes", "memory"),
+        [
+            (
+                "SH of degree 3" if row["channels"] is None else f"{row['channels']} channels",
+                *(named(row), _ms(row, "features_forward_ms"), _ms(row, "features_ms"), _gsplats(record, row)),
+                _gb(row, "features_peak_gb"),
+            )
+            for row in record.rows("features_ms")
+        ],
+    )
+    yield from table(
         ("kernel", "calls an iteration", "µs an iteration", "share"),
         [
             (f"`{row['kernel'].partition('(')[0]}`", f"{row['calls']:g}", f"{row['us']:.0f}", f"{row['share']:.1%}")
@@ -249,8 +262,15 @@ def _ms(row: Row, key: str) -> str:
     return f"{row[key]:.2f} ms" if row.get(key) is not None else ""
 
 
-def _gb(row: Row) -> str:
-    return f"{row['peak_gb']:.2f} GB" if row.get("peak_gb") is not None else ""
+def _gb(row: Row, key: str = "peak_gb") -> str:
+    return f"{row[key]:.2f} GB" if row.get(key) is not None else ""
+
+
+def _gsplats(record: VisitRecord, row: Row) -> str:
+    """Return what gsplat's rasterization took of the same scene: it is timed with spherical harmonics alone."""
+    found = [each for each in record.rows("peer", "raster_ms") if each["peer"] == "gsplat"]
+    same = [each for each in found if named(each) == named(row) and row["channels"] is None]
+    return _ms(same[0], "raster_ms") if same else ""
 
 
 def _last(line: Row) -> str:

@@ -26,6 +26,7 @@ from splatpipe.pipeline.raster.cuda_frame import TILE_PX
 from splatpipe.pipeline.raster.gradients import GradientBuffers
 from splatpipe.pipeline.raster.loss import photo_loss
 from splatpipe.pipeline.raster.optim import Adam
+from splatpipe.pipeline.raster.rasterization import rasterization
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
 from splatpipe.pipeline.raster.sky import STEP_PX, SkyLayer, laid_over_nodes
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
@@ -36,6 +37,15 @@ LOG_SCALE_INCREASE = 1.5  # added: several tiles a Gaussian, so that a chunk of 
 FOUND = 3  # exit code of a run in which the tool found something
 PROBE_S = 5.0  # for a machine's refusal
 REFUSALS = ("Device not supported", "device is not supported", "not supported on")
+SLANTED: Row = {"render_mode": "RGB+D", "depth": "ray"}
+FEATURES: tuple[Row, ...] = (
+    *({"sh_degree": degree} for degree in range(4)),
+    {"channels": 4, "absgrad": True},
+    {"channels": 2} | SLANTED,
+    {"channels": 3, "absgrad": True} | SLANTED,
+    {"channels": 20, "absgrad": True} | SLANTED,
+)
+"""Of every kernel of features; the last two of those for what was not foreseen."""
 SUMMARIES = re.compile(r"(?:ERROR|RACECHECK) SUMMARY: (\d+)")
 PROBE = """
 import ctypes, sys
@@ -104,7 +114,7 @@ def _run(words: Sequence[str]) -> tuple[int, str]:
 
 
 def every_kernel(count: int = SMALL, size: Sequence[int] = SMALL_SIZE) -> Iterator[Row]:
-    """Run every kernel: renders, losses, backward passes, steps, the sky, and density control's draws."""
+    """Run every kernel: renders, losses, backward passes, steps, the sky, features, and density control's draws."""
     with gpu_scenes.device() as where:
         kernels = cuda.kernels_of(where)
         assert kernels is not None
@@ -115,6 +125,8 @@ def every_kernel(count: int = SMALL, size: Sequence[int] = SMALL_SIZE) -> Iterat
             for depth in (False, True):
                 forget_frames(kernels, count, view, foreseen)
                 train_step(model, view, depth)
+            for named in FEATURES if foreseen else FEATURES[-2:]:
+                render_features(model, view, named)
         rows = torch.arange(count, device=where)
         kernels.uniform(1, 2, 3, count)
         kernels.split_offsets((1, 2, 3), rows, model.log_scales.detach(), model.quats.detach())
@@ -132,9 +144,21 @@ def tiles_of(view: Camera) -> int:
 
 def forget_frames(kernels: cuda.CudaKernels, count: int, view: Camera, foreseen: bool) -> None:
     """Set the forecast to a new one, or to one that expects a single pair, so that most of a frame is unforeseen."""
-    kernels.forecast = Forecast(count)
-    if not foreseen:
-        kernels.forecast.update(FrameFacts(FrameSize(count, tiles_of(view)), count, 1, 1))
+    kernels.forecast, kernels.feature_forecast = Forecast(count), Forecast(count)
+    for forecast in (kernels.forecast, kernels.feature_forecast):
+        if not foreseen:
+            forecast.update(FrameFacts(FrameSize(count, tiles_of(view)), count, 1, 1))
+
+
+def render_features(model: Gaussians, view: Camera, named: Row) -> None:
+    """Run ``rasterization`` and its backward pass: of channels or a degree of spherical harmonics."""
+    arguments, where = dict(named), model.means.device
+    given = gpu_scenes.activated(model, arguments.pop("channels", None))
+    leaves = [tensor.requires_grad_() for tensor in given.values()]
+    images, alphas, _ = rasterization(
+        *leaves, *gpu_scenes.matrices(view, where), view.width, view.height, rasterize_mode="antialiased", **arguments
+    )
+    (images.mean() + alphas.mean()).backward()
 
 
 def train_step(model: Gaussians, view: Camera, depth: bool) -> None:

@@ -134,6 +134,24 @@ def gaussians(count: int | None, where: torch.device, seed: int = 0) -> Gaussian
     )
 
 
+def activated(model: Gaussians, channels: int | None) -> dict[str, Tensor]:
+    """Return a model's activated values, and its spherical harmonics or features of either sign, for rasterization."""
+    colors = model.sh
+    if channels is not None:
+        generator = torch.Generator(model.means.device).manual_seed(1)
+        colors = torch.randn(len(model), channels, generator=generator, device=model.means.device)
+    opacities, scales = torch.sigmoid(model.opacity_logits), torch.exp(model.log_scales)
+    given = {"means": model.means, "quats": model.quats, "scales": scales, "opacities": opacities, "colors": colors}
+    return {name: tensor.detach().clone() for name, tensor in given.items()}
+
+
+def matrices(camera: Camera, where: torch.device) -> tuple[Tensor, Tensor]:
+    """Return a camera's pose, (1, 4, 4), and intrinsics, (1, 3, 3)."""
+    pose = torch.as_tensor(camera.cam_from_world, dtype=torch.float32)
+    matrix = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    return pose[None].to(where), matrix[None].to(where)
+
+
 def plain_plan(count: int, **options: object) -> TrainingPlan:
     """Return the plan of a plain training, with all SH bands from the first iteration."""
     config = TrainConfig.model_validate({"iterations": PUBLISHED_ITERATIONS} | PLAIN | options)

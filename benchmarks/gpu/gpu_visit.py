@@ -34,7 +34,13 @@ ROOT = Path(__file__).resolve().parents[2]
 SCRATCH = Path(tempfile.gettempdir()) / "splatpipe-gpu-visit"
 # Time for the parts of a call of 420 and of 200 s: the last part's end and the table take the rest.
 FIRST_S, SECOND_S = 414.0, 194.0
-IMPORTED = ("gpu_proofs", "gpu_speed", "gpu_sanitized", "gpu_peers")  # once, before the parts are forked
+IMPORTED = (
+    "gpu_proofs",
+    "gpu_speed",
+    "gpu_features",
+    "gpu_sanitized",
+    "gpu_peers",
+)  # once, before the parts are forked
 SEEDS = (0, 1, 2)
 TIMED_PEERS = ("gsplat", "faster-gs")
 SMALL_SMOKE = {"count": 3000, "size": [161, 117]}  # under memcheck, which slows kernels down a hundredfold
@@ -104,6 +110,7 @@ def first_call(scale: VisitScale, peers: Sequence[str]) -> list[GpuPart]:
         sanitizer("memcheck", 15, scale),
         sanitizer("racecheck", 15, scale),
         GpuPart("compilers ended", QUIET, {}, 2),
+        GpuPart("features", "gpu_features:agreement", scale.smoke or {}, 8),
         speed("middle, made", 18, count=scale.middle),
         speed("few, made", 11, count=scale.few),
         speed("many, made", 18, count=scale.many),
@@ -111,6 +118,12 @@ def first_call(scale: VisitScale, peers: Sequence[str]) -> list[GpuPart]:
         speed("few, default preset", 11, count=scale.few, preset=True),
         speed("middle, default preset", 12, count=scale.middle, preset=True),
         speed("trained scene", 10, count=None),
+        GpuPart(
+            "features, middle",
+            "gpu_features:speed",
+            {"count": scale.middle, "megapixels": scale.megapixels, "repeats": (scale.repeats + 1) // 2},
+            8,
+        ),
         *(
             GpuPart(f"{peer}, {name}", "gpu_peers:speed", plain | {"peer": peer, "count": count}, limit_s, ours=False)
             for name, count, limit_s in (

@@ -31,7 +31,8 @@ FLAGS = (
     "-Werror=all-warnings",
     "-Xcompiler=-Wall,-Wextra,-Werror,-fPIC",
 )
-FLAGS_OF = {"frame.cu": ("-fmad=false",)}  # further compiler flags by source file, as in the pipeline's build
+# Further compiler flags by source file, as in the pipeline's build.
+FLAGS_OF = dict.fromkeys(("frame.cu", "features.cu"), ("-fmad=false",))
 ENTRY = re.compile(r"Compiling entry function '(\w+)' for 'sm_(\d+)\w*'")
 SPILLS = re.compile(r"(\d+) bytes spill stores, (\d+) bytes spill loads")
 USED = re.compile(r"Used (\d+) registers(?:.*?(\d+) bytes smem)?")

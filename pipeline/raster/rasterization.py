@@ -10,8 +10,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from splatpipe.pipeline.raster import feature_kernels, feature_reference
-from splatpipe.pipeline.raster.feature_definitions import BlendOptions, Projected, ProjectionOptions
+from splatpipe.pipeline.raster.cuda.cuda import kernels_of
+from splatpipe.pipeline.raster.cuda.cuda_library import unavailable_reason
+from splatpipe.pipeline.raster.cuda_features import CudaFeatures
+from splatpipe.pipeline.raster.feature_autograd import steps_of
+from splatpipe.pipeline.raster.feature_definitions import BlendOptions, Projected, ProjectionOptions, Steps
+from splatpipe.pipeline.raster.feature_kernels import NATIVE
+from splatpipe.pipeline.raster.feature_reference import REFERENCE
 from splatpipe.pipeline.raster.rasterization_arguments import (
     DepthMode,
     RasterizeMode,
@@ -75,8 +80,9 @@ def rasterization(
     that a script swaps one import; the last four, by name only, are what splatpipe's own renders do otherwise. Batches
     lead with any dimensions (``...``), the same for all tensors.
 
-    On the CPU in float32 the native kernels render, bit-identical for any number of threads. In float64, and on a
-    CUDA device, the torch reference does: correct, but slow, and memory grows with pixels times Gaussians.
+    In float32 native kernels render: on the CPU bit-identical for any number of threads, on a CUDA device from run to
+    run. In float64, and on a device for which there are no kernels, the torch reference does: correct, but slow, and
+    memory grows with pixels times Gaussians.
 
     Args:
         means: Centres (..., N, 3), world units.
@@ -196,10 +202,7 @@ def _render(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Project, find colours, blend; backgrounds are (v, d); results as of ``rasterization``."""
-    native = scene.means.device.type == "cpu" and scene.means.dtype == torch.float32
-    if scene.means.device.type != "cpu":
-        _warn_of_reference()
-    steps = feature_kernels.NATIVE if native else feature_reference.REFERENCE
+    steps = _steps_for(scene.means.device, scene.means.dtype)
     projected = steps.project(scene.views, projection, scene.means, scene.quats, scene.scales, scene.opacities)
     of_gaussians = (*scene.lead, scene.cameras, scene.means.shape[1])
     means2d = projected.means2d.reshape(*of_gaussians, 2)  # the caller asks this very tensor for its gradient
@@ -261,9 +264,23 @@ def _conics(projected: Projected) -> Tensor:
     return torch.stack([yy, -xy, xx], -1) / determinants[..., None]
 
 
+def _steps_for(device: torch.device, dtype: torch.dtype) -> Steps:
+    """The fastest backend for a device's tensors."""
+    if dtype != torch.float32:
+        return REFERENCE
+    if (kernels := kernels_of(device)) is not None:
+        return steps_of(CudaFeatures(kernels))
+    if device.type == "cpu":
+        return NATIVE
+    _warn_of_reference(device.type)
+    return REFERENCE
+
+
 @functools.cache
-def _warn_of_reference() -> None:
+def _warn_of_reference(device: str) -> None:
+    missing = unavailable_reason() if device == "cuda" else None
+    why = f"There are none for {device}." if missing is None else f"{missing.reason} {missing.hint}"
     warnings.warn(
-        "rasterization has native kernels for the CPU only: on other devices the slow torch reference renders.",
-        stacklevel=4,  # the caller of rasterization
+        f"The slow torch reference renders, not rasterization's kernels. {why}",
+        stacklevel=5,  # the caller of rasterization
     )

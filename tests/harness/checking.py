@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from agreement import gradient_complaints, picture_complaints
@@ -26,6 +27,13 @@ TIMEOUT_S = 60
 """Far longer than all checks of one fault: detects endless loops."""
 
 
+class Truth(Protocol):
+    """What kernels are checked against."""
+
+    def complaints(self, library: CudaLibrary) -> Iterator[str]:
+        """Yield what is wrong with the kernels; nothing if they are right."""
+
+
 @dataclass(frozen=True)
 class ReferenceResult:
     """Results by the definition: images and gradients of frames, a loss, draws, and images of a large frame."""
@@ -35,41 +43,40 @@ class ReferenceResult:
     draws: Draws
     large: tuple[RenderCase, RenderOutcome]
 
+    def complaints(self, library: CudaLibrary) -> Iterator[str]:
+        """Yield what is wrong with the kernels; nothing if they are right."""
+        harness = controls(library)
+        harness.harness_multiprocessors(1)  # so that blocks take several turns
+        firsts: list[RenderOutcome] = []
+        for turn, order in enumerate(ORDERS):
+            harness.harness_order(*order)
+            for number, (case, exact) in enumerate(self.frames):
+                ours = run(library, case)
+                yield from picture_complaints(ours, exact)
+                yield from gradient_complaints(ours, exact)
+                if turn == 0:
+                    firsts.append(ours)
+                yield from (f"{name} differs by order" for name in ours.differs(firsts[number]))
+                pairs = ours.facts[0]
+                again = run(library, case, (pairs // 3, pairs // 3, pairs - 1)[turn], turn + 1)
+                yield from (f"{name} differs by chunks" for name in again.differs(ours))
+                yield from step_complaints(library, case, exact)
+            case, exact = self.large
+            yield from picture_complaints(run(library, case), exact)
+            yield from self.loss.complaints(library)
+            yield from self.draws.complaints(library)
 
-def complaints(library: CudaLibrary, truth: ReferenceResult) -> Iterator[str]:
-    """Yield what is wrong with the kernels; nothing if they are right."""
-    harness = controls(library)
-    harness.harness_multiprocessors(1)  # so that blocks take several turns
-    firsts: list[RenderOutcome] = []
-    for turn, order in enumerate(ORDERS):
-        harness.harness_order(*order)
-        for number, (case, exact) in enumerate(truth.frames):
-            ours = run(library, case)
-            yield from picture_complaints(ours, exact)
-            yield from gradient_complaints(ours, exact)
-            if turn == 0:
-                firsts.append(ours)
-            yield from (f"{name} differs by order" for name in ours.differs(firsts[number]))
-            pairs = ours.facts[0]
-            again = run(library, case, (pairs // 3, pairs // 3, pairs - 1)[turn], turn + 1)
-            yield from (f"{name} differs by chunks" for name in again.differs(ours))
-            yield from step_complaints(library, case, exact)
-        case, exact = truth.large
-        yield from picture_complaints(run(library, case), exact)
-        yield from truth.loss.complaints(library)
-        yield from truth.draws.complaints(library)
 
-
-def first_complaint(library: CudaLibrary, truth: ReferenceResult) -> str:
+def first_complaint(library: CudaLibrary, truth: Truth) -> str:
     """Return the first of ``complaints``, including a failure to run at all; empty if there is none."""
     np.seterr(all="ignore")  # poison is signalling NaN
     try:
-        return next(complaints(library, truth), "")
+        return next(truth.complaints(library), "")
     except (MachineError, AssertionError) as error:
         return str(error)
 
 
-def in_a_process(library: CudaLibrary, truth: ReferenceResult, fault: int) -> str:
+def in_a_process(library: CudaLibrary, truth: Truth, fault: int) -> str:
     """Return ``first_complaint`` with a fault active, or how the process ended."""
     reading, writing = os.pipe()
     child = os.fork()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,7 +137,7 @@ FAULTS = (
     ),
     KernelFault(
         "no barrier of the grid before the lists that nobody foresaw are blended",
-        "cuda/frame.cu",
+        "cuda/bin.cuh",
         "scatter_digits(tile_pass(job.at, pass));\n    }\n    sync_grid();",
         "scatter_digits(tile_pass(job.at, pass));\n    }\n    if (!FAULT) sync_grid();",
     ),
@@ -317,14 +318,18 @@ FAULTS = (
 )
 
 
-def planted() -> Path:
+def planted(faults: Sequence[KernelFault] = FAULTS, name: str = "splat_cuda_with_faults") -> Path:
     """Return the kernels with all faults planted, none active until ``harness_fault`` sets its number, from 1.
+
+    Args:
+        faults: Mistakes to plant.
+        name: Name of the library.
 
     Raises:
         AssertionError: if a snippet does not occur in its file exactly once.
     """
     texts: dict[Path, str] = {}
-    for number, fault in enumerate(FAULTS, start=1):
+    for number, fault in enumerate(faults, start=1):
         path = NATIVE / fault.file
         text = path.read_text()
         assert text.count(fault.snippet) == 1, f"{fault.file} has '{fault.snippet}' {text.count(fault.snippet)} times"
@@ -332,4 +337,4 @@ def planted() -> Path:
         assert changed.count(fault.snippet) == 1, f"two faults in one place of {fault.file}: {fault.name}"
         texts[path] = changed.replace(fault.snippet, fault.instead.replace(ALIVE, f"(::harness::fault() == {number})"))
     texts = {path: f'#include "base/device.h"\n{text}' for path, text in texts.items()}  # which includes the harness
-    return build_on_cpu([*kernel_sources(), HARNESS / "peek.cu"], "splat_cuda_with_faults", changed=texts)
+    return build_on_cpu([*kernel_sources(), HARNESS / "peek.cu"], name, changed=texts)

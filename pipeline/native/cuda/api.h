@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define SPLAT_CUDA_ABI 4 /* raised with every change of the interface; the caller rejects other versions */
+#define SPLAT_CUDA_ABI 5 /* raised with every change of the interface; the caller rejects other versions */
 #define SPLAT_API __attribute__((visibility("default")))
 
 enum {
@@ -131,6 +131,71 @@ typedef struct {
     const uint8_t* mask;         /* (h, w): where the nodes have a gradient, null for nowhere */
 } SplatSky;
 
+/* Activated Gaussians; scales of either sign. The next structures are those of raster/features.h. */
+typedef struct {
+    int64_t count;
+    const float *means, *quats, *scales, *opacities;
+} SplatActivated;
+
+typedef struct {
+    float *means, *quats, *scales;
+} SplatActivatedGradients;
+
+typedef struct {
+    float far_z, blur_px2, plane_sigmas, compensation_min, radius_clip;
+    int32_t reserved;
+} SplatProjectOptions;
+
+/* Compensations and slants may be null. */
+typedef struct {
+    float *means2d, *depths, *covariances, *determinants, *compensations, *slants;
+    int32_t* radii;
+} SplatProjected;
+
+/* Null for zero. */
+typedef struct {
+    const float *means2d, *depths, *covariances, *compensations, *slants;
+} SplatProjectedGradients;
+
+typedef struct {
+    int64_t count;
+    const float *means, *sh;
+    const int32_t* radii;
+    double centre[3]; /* of projection, world: the inverse pose's translation, also of a pose that scales */
+} SplatShRows;
+
+/* What is blended in one view. */
+typedef struct {
+    const float *means2d, *depths, *covariances, *determinants, *opacities;
+    const float* slants; /* null: the last channel is the same all over a splat */
+    const int32_t* radii;
+    const float* features;   /* (n, stride): the channels, then zeros */
+    const float* background; /* (channels), null for zeros */
+    int32_t channels;
+    int32_t stride; /* up to SPLAT_INLINE_CHANNELS the number of channels; of more, that rounded up to a multiple of
+                       four, of rows aligned to 16 bytes */
+    float alpha_max;
+    int32_t reserved;
+} SplatFeatures;
+#define SPLAT_INLINE_CHANNELS 4
+
+/* (h, w, channels) and (h, w). */
+typedef struct {
+    float *features, *alpha;
+} SplatFeaturePictures;
+
+/* (channels, h, w), so that neighbouring threads read neighbouring values, and (h, w). Null for zero. */
+typedef struct {
+    const float *features, *alpha;
+} SplatFeaturePictureGradients;
+
+typedef struct {
+    float *means2d, *covariances, *opacities;
+    float* features;   /* (n, channels) */
+    float* slants;     /* null without slants */
+    float* magnitudes; /* (n, 2): sums of each pixel's |dL/d(means2d)|; null if not needed */
+} SplatFeatureGradients;
+
 SPLAT_API int32_t splat_abi(void);
 SPLAT_API const char* splat_error(int32_t code);
 SPLAT_API int32_t splat_device(int32_t device, SplatDevice* out); /* the current CUDA version and device; host only */
@@ -150,6 +215,28 @@ SPLAT_API int32_t splat_project_backward(const SplatShot* shot, const SplatRows*
 /* The same, fused with a step of Adam; stores no gradient except means2d (rows, 2), null if not needed. */
 SPLAT_API int32_t splat_step(const SplatShot* shot, const SplatFrame* frame, const SplatStep* step, float* means2d,
                              const SplatStream* on);
+
+/* Activated Gaussians and features of any number of channels, in steps: projection, spherical harmonics, blending. Of
+ * the shot, only what the step needs is read. Backward passes add to what the arrays hold, so that views can share
+ * them, and leave rows alone that are not visible. */
+SPLAT_API int32_t splat_project_activated(const SplatShot* shot, const SplatProjectOptions* options,
+                                          const SplatActivated* gaussians, const SplatProjected* out,
+                                          const SplatStream* on);
+SPLAT_API int32_t splat_project_activated_backward(const SplatShot* shot, const SplatProjectOptions* options,
+                                                   const SplatActivated* gaussians, const int32_t* radii,
+                                                   const SplatProjectedGradients* gradients,
+                                                   const SplatActivatedGradients* out, const SplatStream* on);
+/* Colours (n, 3), clamped at 0; zeros where not visible. */
+SPLAT_API int32_t splat_sh_colours(const SplatShot* shot, const SplatShRows* rows, float* out, const SplatStream* on);
+SPLAT_API int32_t splat_sh_colours_backward(const SplatShot* shot, const SplatShRows* rows, const float* gradients,
+                                            float* means, float* sh, const SplatStream* on);
+/* A frame as of splat_forward, with memory of splat_frame_bytes; back_bytes at least splat_feature_back_bytes. */
+SPLAT_API int64_t splat_feature_back_bytes(const SplatShot* shot, int64_t count, int64_t capacity, int32_t channels);
+SPLAT_API int32_t splat_blend_features(const SplatShot* shot, const SplatFeatures* features, const SplatFrame* frame,
+                                       const SplatFeaturePictures* pictures, const SplatStream* on);
+SPLAT_API int32_t splat_blend_features_backward(const SplatShot* shot, const SplatFeatures* features,
+                                                const SplatFrame* frame, const SplatFeaturePictureGradients* gradients,
+                                                const SplatFeatureGradients* out, const SplatStream* on);
 
 /* Loss: (1 - w) L1 + w (1 - SSIM) of (h, w, 3) images, masked where `mask` (h, w) uint8 is zero, null for nowhere. Of
  * the unmasked pixels those in `inner` count, null for all; SSIM windows see everything. Writes its gradient for the

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "cuda/frame.h"
+#include "cuda/grid.cuh"
 #include "cuda/project.cuh"
 #include "cuda/scan.cuh"
 #include "cuda/sort.cuh"
@@ -12,6 +13,9 @@ namespace cuda {
 // Maximum that a thread counts or writes by itself; a splat with more is processed by the whole warp.
 constexpr int kOwnRows = 4;
 constexpr uint32_t kOwnPairs = 16;
+
+constexpr int kTilePasses = 16 / kDigitBits;
+static_assert(kTilePasses % 2 == 0, "what is sorted ends where it began");
 
 // End of the chunk that starts at tile `first`: as many tiles as its pairs allow. No single tile has more than
 // `capacity` pairs, which is at least the number of Gaussians.
@@ -231,6 +235,46 @@ __device__ inline void emit_pairs(const Job& job, int chunk) {
         }
         __syncthreads();
     }
+}
+
+using TilePass = SortPass<uint16_t, uint32_t>;
+
+// A pass of the sort by tile, from one half of the memory to the other or back; the first takes places for values. (Not
+// by an index: for that, a kernel would copy its argument.)
+__host__ __device__ inline TilePass tile_pass(const FrameMemory& at, int pass) {
+    const bool odd = pass % 2;
+    uint16_t *keys = at.pair_keys[0], *other_keys = at.pair_keys[1];
+    uint32_t *values = at.pair_values[0], *other_values = at.pair_values[1];
+    return {odd ? other_keys : keys,
+            odd ? keys : other_keys,
+            odd ? other_values : (pass ? values : nullptr),
+            odd ? values : other_values,
+            0,
+            &at.header->sorted,
+            pass * kDigitBits,
+            at.digit_table,
+            at.digit_sums,
+            nullptr};
+}
+
+__device__ inline bool is_chunk(const Job& job, int chunk) { return chunk < job.at.header->facts.chunks; }
+
+// All of a chunk's lists, by blocks that wait for each other.
+__device__ SPLAT_ONCE inline void bin_chunk(const Job& job, int chunk) {
+    count_pairs(job, chunk);
+    sync_grid();
+    if (blockIdx.x == 0) scan_pairs(job);
+    sync_grid();
+    emit_pairs(job, chunk);
+    for (int pass = 0; pass < kTilePasses; ++pass) {
+        sync_grid();
+        count_digits(tile_pass(job.at, pass));
+        sync_grid();
+        scan_digits(tile_pass(job.at, pass));
+        sync_grid();
+        scatter_digits(tile_pass(job.at, pass));
+    }
+    sync_grid();
 }
 
 }  // namespace cuda

@@ -14,16 +14,15 @@ namespace cuda {
 namespace {
 
 constexpr int64_t kMaxPairs = (int64_t{1} << 31) - kSortBlock;  // per chunk: they are counted in signed 32 bits
-constexpr int kDepthPasses = 32 / kDigitBits, kTilePasses = 16 / kDigitBits;
-static_assert(kDepthPasses % 2 == 0 && kTilePasses % 2 == 0, "what is sorted ends where it began");
+constexpr int kDepthPasses = 32 / kDigitBits;
+static_assert(kDepthPasses % 2 == 0, "what is sorted ends where it began");
 constexpr int kProjectBlocks = 3;  // per multiprocessor: worth the three words spilled for it
 constexpr int kScatterBlocks = 3;  // with more, registers are spilled
 constexpr int kRestBlocks = 2;     // with more, more registers are spilled
 constexpr int64_t kTurns = 8;      // blocks a multiprocessor of work that is done in turns: what it holds at once
 
-// Passes of the sorts, from one half of the memory to the other and back; the first takes places for values.
+// A pass of the sort by depth, from one half of the memory to the other or back; the first takes places for values.
 using DepthPass = SortPass<uint32_t, int32_t>;
-using TilePass = SortPass<uint16_t, uint32_t>;
 
 DepthPass depth_pass(const Job& job, int pass) {
     const FrameMemory& at = job.at;
@@ -41,23 +40,6 @@ DepthPass depth_pass(const Job& job, int pass) {
             pass ? nullptr : visible};
 }
 
-// (Not by an index: for that, a kernel would copy its argument.)
-__host__ __device__ inline TilePass tile_pass(const FrameMemory& at, int pass) {
-    const bool odd = pass % 2;
-    uint16_t *keys = at.pair_keys[0], *other_keys = at.pair_keys[1];
-    uint32_t *values = at.pair_values[0], *other_values = at.pair_values[1];
-    return {odd ? other_keys : keys,
-            odd ? keys : other_keys,
-            odd ? other_values : (pass ? values : nullptr),
-            odd ? values : other_values,
-            0,
-            &at.header->sorted,
-            pass * kDigitBits,
-            at.digit_table,
-            at.digit_sums,
-            nullptr};
-}
-
 __global__ void __launch_bounds__(kThreads, kProjectBlocks) project_kernel(Job job) { project_phase(job); }
 
 __global__ void __launch_bounds__(kThreads) count_depths(DepthPass pass) { count_digits(pass); }
@@ -65,15 +47,6 @@ __global__ void __launch_bounds__(kThreads) scan_depths(DepthPass pass) { scan_d
 __global__ void __launch_bounds__(kThreads, kScatterBlocks) scatter_depths(DepthPass pass) { scatter_digits(pass); }
 
 __global__ void __launch_bounds__(kThreads) plan_kernel(Job job) { plan_phase(job); }
-
-__device__ inline bool is_chunk(const Job& job, int chunk) { return chunk < job.at.header->facts.chunks; }
-
-// The kernels of a chunk do nothing if it does not exist, and its binning kernels do nothing in the backward pass if
-// the lists of the forward pass are still there, i.e. if there was one chunk.
-struct Turn {
-    int chunk;
-    bool back;
-};
 
 __device__ inline bool is_to_bin(const Job& job, const Turn& turn) {
     return is_chunk(job, turn.chunk) && !(turn.back && job.at.header->facts.chunks == 1);
@@ -115,24 +88,6 @@ __global__ void __launch_bounds__(kThreads) sum_kernel(Job job, int chunk, bool 
     if (is_chunk(job, chunk) && !(only && job.at.header->facts.chunks > 1)) sum_slots<kDepth>(job, chunk);
 }
 
-// All of a chunk's lists, by blocks that wait for each other.
-__device__ SPLAT_ONCE void bin_chunk(const Job& job, int chunk) {
-    count_pairs(job, chunk);
-    sync_grid();
-    if (blockIdx.x == 0) scan_pairs(job);
-    sync_grid();
-    emit_pairs(job, chunk);
-    for (int pass = 0; pass < kTilePasses; ++pass) {
-        sync_grid();
-        count_digits(tile_pass(job.at, pass));
-        sync_grid();
-        scan_digits(tile_pass(job.at, pass));
-        sync_grid();
-        scatter_digits(tile_pass(job.at, pass));
-    }
-    sync_grid();
-}
-
 // What exceeds the forecast, however many chunks: the host knows of none, and a launch for each that there might be
 // would cost more than the frame. Without any, the blocks return at once.
 template <bool kDepth>
@@ -164,40 +119,6 @@ int slot_floats_of(const SplatShot& shot) { return shot.depths ? kDepthSlotFloat
 
 bool is_aligned(const void* memory) { return memory && reinterpret_cast<uintptr_t>(memory) % 256 == 0; }
 
-// Chunks with launches of their own. A chunk has kChunkTiles tiles at most: as many rounds as that takes are always
-// foreseen.
-int passes_of(const Job& job, const SplatFrame& frame) {
-    const int least = static_cast<int>(divide_up(job.tiles, kChunkTiles));
-    return frame.passes > least ? frame.passes : least;
-}
-
-void launch_sort_by_depth(const Job& job, cudaStream_t stream) {
-    const int64_t blocks = blocks_for(sort_blocks(job.model.count));
-    for (int pass = 0; pass < kDepthPasses; ++pass) {
-        const DepthPass of = depth_pass(job, pass);
-        SPLAT_LAUNCH(count_depths, blocks, stream, of);
-        SPLAT_LAUNCH(scan_depths, kScanBlocks, stream, of);
-        SPLAT_LAUNCH(scatter_depths, blocks, stream, of);
-    }
-}
-
-void launch_bin(const Job& job, const Turn& turn, cudaStream_t stream) {
-    const int64_t ranks = blocks_for(divide_up(job.model.count, kScanBlock));
-    const int64_t blocks = blocks_for(sort_blocks(job.capacity));
-    SPLAT_LAUNCH(count_pairs_kernel, ranks, stream, job, turn);
-    SPLAT_LAUNCH(scan_pairs_kernel, 1, stream, job, turn);
-    SPLAT_LAUNCH(emit_pairs_kernel, ranks, stream, job, turn);
-    for (int pass = 0; pass < kTilePasses; ++pass) {
-        const TilePass of = tile_pass(job.at, pass);
-        SPLAT_LAUNCH(count_tiles, blocks, stream, job, turn, of);
-        SPLAT_LAUNCH(scan_tiles, kScanBlocks, stream, job, turn, of);
-        SPLAT_LAUNCH(scatter_tiles, blocks, stream, job, turn, of);
-    }
-}
-
-// One block per tile, as many as a chunk can have.
-int64_t tile_blocks(const Job& job) { return job.tiles < kChunkTiles ? job.tiles : kChunkTiles; }
-
 template <bool kDepth>
 void launch_chunks(const Job& job, int passes, cudaStream_t stream) {
     for (int chunk = 0; chunk < passes; ++chunk) {
@@ -228,6 +149,45 @@ bool has_pictures(const SplatShot& shot, const SplatPictures& to) {
 }
 
 }  // namespace
+
+int passes_of(const Job& job, const SplatFrame& frame) {
+    const int least = static_cast<int>(divide_up(job.tiles, kChunkTiles));
+    return frame.passes > least ? frame.passes : least;
+}
+
+void clear_counts(const Job& job, cudaStream_t stream) {
+    cudaMemsetAsync(job.at.header, 0, sizeof(Header), stream);
+    cudaMemsetAsync(job.at.tile_counts, 0, (job.tiles + size_t{1}) * sizeof(int32_t), stream);
+}
+
+void launch_plan(const Job& job, cudaStream_t stream) {
+    if (job.model.count) {
+        const int64_t blocks = blocks_for(sort_blocks(job.model.count));
+        for (int pass = 0; pass < kDepthPasses; ++pass) {
+            const DepthPass of = depth_pass(job, pass);
+            SPLAT_LAUNCH(count_depths, blocks, stream, of);
+            SPLAT_LAUNCH(scan_depths, kScanBlocks, stream, of);
+            SPLAT_LAUNCH(scatter_depths, blocks, stream, of);
+        }
+    }
+    SPLAT_LAUNCH(plan_kernel, 1, stream, job);
+}
+
+void launch_bin(const Job& job, const Turn& turn, cudaStream_t stream) {
+    const int64_t ranks = blocks_for(divide_up(job.model.count, kScanBlock));
+    const int64_t blocks = blocks_for(sort_blocks(job.capacity));
+    SPLAT_LAUNCH(count_pairs_kernel, ranks, stream, job, turn);
+    SPLAT_LAUNCH(scan_pairs_kernel, 1, stream, job, turn);
+    SPLAT_LAUNCH(emit_pairs_kernel, ranks, stream, job, turn);
+    for (int pass = 0; pass < kTilePasses; ++pass) {
+        const TilePass of = tile_pass(job.at, pass);
+        SPLAT_LAUNCH(count_tiles, blocks, stream, job, turn, of);
+        SPLAT_LAUNCH(scan_tiles, kScanBlocks, stream, job, turn, of);
+        SPLAT_LAUNCH(scatter_tiles, blocks, stream, job, turn, of);
+    }
+}
+
+int64_t tile_blocks(const Job& job) { return job.tiles < kChunkTiles ? job.tiles : kChunkTiles; }
 
 int64_t lay_out(void* memory, int64_t count, int64_t tiles, int64_t capacity, FrameMemory* at) {
     Carver carver(memory);
@@ -261,18 +221,25 @@ int64_t lay_out(void* memory, int64_t count, int64_t capacity, int slot_floats, 
     return carver.bytes();
 }
 
-int32_t prepare(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame, bool back, Job* job) {
+int32_t prepare(const SplatShot* shot, const SplatFrame* frame, Job* job) {
     *job = Job{};
-    if (!model || !frame || !is_size(shot, frame->count, frame->capacity, &job->view)) return SPLAT_BAD_ARGUMENT;
-    const bool has_rows = model->means && model->log_scales && model->quats && model->opacity_logits && model->sh;
-    if (frame->passes < 1 || (frame->count && !has_rows) || !is_aligned(frame->memory)) return SPLAT_BAD_ARGUMENT;
-    job->model = {frame->count, model->means, model->log_scales, model->quats, model->opacity_logits, model->sh};
+    if (!frame || !is_size(shot, frame->count, frame->capacity, &job->view)) return SPLAT_BAD_ARGUMENT;
+    if (frame->passes < 1 || !is_aligned(frame->memory)) return SPLAT_BAD_ARGUMENT;
+    job->model.count = frame->count;
     job->capacity = frame->capacity;
     job->tiles = job->view.tiles_x * job->view.tiles_y;
+    const int64_t bytes = lay_out(frame->memory, frame->count, job->tiles, frame->capacity, &job->at);
+    return bytes > frame->bytes ? SPLAT_TOO_LITTLE : SPLAT_OK;
+}
+
+int32_t prepare(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame, bool back, Job* job) {
+    const bool has_rows =
+        model && model->means && model->log_scales && model->quats && model->opacity_logits && model->sh;
+    if (!model || !frame || (frame->count && !has_rows)) return SPLAT_BAD_ARGUMENT;
+    if (const int32_t code = prepare(shot, frame, job)) return code;
+    job->model = {frame->count, model->means, model->log_scales, model->quats, model->opacity_logits, model->sh};
     job->slot_floats = slot_floats_of(*shot);
     job->magnitudes = shot->magnitudes;
-    if (lay_out(frame->memory, frame->count, job->tiles, frame->capacity, &job->at) > frame->bytes)
-        return SPLAT_TOO_LITTLE;
     if (!back) return SPLAT_OK;
     const int64_t bytes = lay_out(frame->back, frame->count, frame->capacity, job->slot_floats, &job->back);
     if (bytes > frame->back_bytes) return SPLAT_TOO_LITTLE;
@@ -318,13 +285,9 @@ int32_t splat_forward(const SplatShot* shot, const SplatRows* model, const Splat
     job.pictures = {pictures->colour, pictures->alpha, pictures->depth_sum, pictures->depth_square_sum,
                     pictures->median_depth};
     job.radii = radii, job.visible = visible;
-    cudaMemsetAsync(job.at.header, 0, sizeof(Header), stream);
-    cudaMemsetAsync(job.at.tile_counts, 0, (job.tiles + size_t{1}) * sizeof(int32_t), stream);
-    if (frame->count) {
-        SPLAT_LAUNCH(project_kernel, divide_up(frame->count, kThreads), stream, job);
-        launch_sort_by_depth(job, stream);
-    }
-    SPLAT_LAUNCH(plan_kernel, 1, stream, job);
+    clear_counts(job, stream);
+    if (frame->count) SPLAT_LAUNCH(project_kernel, divide_up(frame->count, kThreads), stream, job);
+    launch_plan(job, stream);
     const int passes = passes_of(job, *frame);
     if (shot->depths)
         launch_chunks<true>(job, passes, stream);

@@ -106,12 +106,37 @@ class Carver {
 int64_t lay_out(void* memory, int64_t count, int64_t tiles, int64_t capacity, FrameMemory* at);
 int64_t lay_out(void* memory, int64_t count, int64_t capacity, int slot_floats, BackMemory* at);
 
-// Validates the caller's arguments and fills a job, except images, their gradients, radii and visible. `back`: whether
-// the backward pass's memory is needed. Returns a code of api.h. In frame.cu.
+// Validates the caller's arguments and fills a job's view, sizes and frame memory. Returns a code of api.h. In
+// frame.cu.
+int32_t prepare(const SplatShot* shot, const SplatFrame* frame, Job* job);
+
+// The same of a render of raw parameters: validates and fills all of a job, except images, their gradients, radii and
+// visible. `back`: whether the backward pass's memory is needed. Returns a code of api.h. In frame.cu.
 int32_t prepare(const SplatShot* shot, const SplatRows* model, const SplatFrame* frame, bool back, Job* job);
 
 // Number of blocks for `work` virtual ones that can take turns: enough to fill the device, at least one. In frame.cu.
 int64_t blocks_for(int64_t work);
+
+// The launches of a frame's lists, all in frame.cu. First, memory that counts from zero; then the kernel that fills
+// records, rows and keys and counts the tiles' pairs; then the sort by depth and the plan; then each chunk's lists.
+void clear_counts(const Job& job, cudaStream_t stream);
+void launch_plan(const Job& job, cudaStream_t stream);
+
+// The kernels of a chunk do nothing if it does not exist, and its binning kernels do nothing in the backward pass if
+// the lists of the forward pass are still there, i.e. if there was one chunk.
+struct Turn {
+    int chunk;
+    bool back;
+};
+
+void launch_bin(const Job& job, const Turn& turn, cudaStream_t stream);
+
+// Chunks with launches of their own. A chunk has kChunkTiles tiles at most: as many rounds as that takes are always
+// foreseen.
+int passes_of(const Job& job, const SplatFrame& frame);
+
+// One block per tile, as many as a chunk can have.
+int64_t tile_blocks(const Job& job);
 
 }  // namespace cuda
 }  // namespace splat

@@ -27,6 +27,7 @@ from splatpipe.pipeline.raster.cuda.cuda_library import CudaDevice, CudaLibrary,
 from splatpipe.pipeline.splat.model.upload import upload
 
 ALIGNMENT = 256  # bytes, of memory passed to kernels
+FEATURE_PAIR = 2  # times the memory of a pair, if features are blended: up to 27 floats backward
 
 
 class CudaKernels:
@@ -40,6 +41,7 @@ class CudaKernels:
         device: As given.
         index: Its number.
         forecast: Forecast of frame allocations.
+        feature_forecast: The same for frames of features.
         facts: The device, as the library sees it.
     """
 
@@ -50,6 +52,7 @@ class CudaKernels:
         if code:
             raise MachineError(f"The CUDA kernels cannot use {self.facts.name or device}: {library.error(code)}.")
         self.forecast = Forecast(most_pairs_of(self.facts.memory_bytes))
+        self.feature_forecast = Forecast(most_pairs_of(self.facts.memory_bytes // FEATURE_PAIR))
 
     def stream(self) -> SplatStream:
         """Torch's current stream on the device."""
@@ -94,6 +97,10 @@ class CudaKernels:
     def back_bytes(self, view: SplatShot, count: int, capacity: int) -> int:
         """Additional memory of its backward pass, bytes."""
         return self._library.size("splat_back_bytes", ctypes.byref(view), count, capacity)
+
+    def feature_back_bytes(self, view: SplatShot, count: int, capacity: int, channels: int) -> int:
+        """Additional memory of the backward pass of a frame of features, bytes."""
+        return self._library.size("splat_feature_back_bytes", ctypes.byref(view), count, capacity, channels)
 
     def photo_loss(
         self,

@@ -6,12 +6,14 @@ import ctypes
 from ctypes import POINTER, c_char, c_double, c_float, c_int32, c_int64, c_uint64, c_void_p
 from typing import Any
 
-ABI = 4
+ABI = 5
 """Version of the interface mirrored here, SPLAT_CUDA_ABI."""
 NO_KERNEL = -3
 """SPLAT_NO_KERNEL: this binary has no kernel for the device."""
 ADAM_TENSORS = 8
 """Maximum number of tensors in one call of ``splat_adam``."""
+INLINE_CHANNELS = 4
+"""SPLAT_INLINE_CHANNELS: features of more channels are in rows of whole groups of four."""
 
 
 class SplatStream(ctypes.Structure):
@@ -145,6 +147,78 @@ class SplatSky(ctypes.Structure):
     )
 
 
+class SplatActivated(ctypes.Structure):
+    _fields_ = (("count", c_int64), *((name, c_void_p) for name in ("means", "quats", "scales", "opacities")))
+
+
+class SplatActivatedGradients(ctypes.Structure):
+    _fields_ = tuple((name, c_void_p) for name in ("means", "quats", "scales"))
+
+
+class SplatProjectOptions(ctypes.Structure):
+    _fields_ = (
+        ("far_z", c_float),
+        ("blur_px2", c_float),
+        ("plane_sigmas", c_float),
+        ("compensation_min", c_float),
+        ("radius_clip", c_float),
+        ("reserved", c_int32),
+    )
+
+
+class SplatProjected(ctypes.Structure):
+    _fields_ = tuple(
+        (name, c_void_p)
+        for name in ("means2d", "depths", "covariances", "determinants", "compensations", "slants", "radii")
+    )
+
+
+class SplatProjectedGradients(ctypes.Structure):
+    _fields_ = tuple((name, c_void_p) for name in ("means2d", "depths", "covariances", "compensations", "slants"))
+
+
+class SplatShRows(ctypes.Structure):
+    _fields_ = (
+        ("count", c_int64),
+        ("means", c_void_p),
+        ("sh", c_void_p),
+        ("radii", c_void_p),
+        ("centre", c_double * 3),
+    )
+
+
+class SplatFeatures(ctypes.Structure):
+    _fields_ = (
+        ("means2d", c_void_p),
+        ("depths", c_void_p),
+        ("covariances", c_void_p),
+        ("determinants", c_void_p),
+        ("opacities", c_void_p),
+        ("slants", c_void_p),
+        ("radii", c_void_p),
+        ("features", c_void_p),
+        ("background", c_void_p),
+        ("channels", c_int32),
+        ("stride", c_int32),
+        ("alpha_max", c_float),
+        ("reserved", c_int32),
+    )
+
+
+class SplatFeaturePictures(ctypes.Structure):
+    _fields_ = (("features", c_void_p), ("alpha", c_void_p))
+
+
+class SplatFeaturePictureGradients(ctypes.Structure):
+    _fields_ = (("features", c_void_p), ("alpha", c_void_p))
+
+
+class SplatFeatureGradients(ctypes.Structure):
+    _fields_ = tuple(
+        (name, c_void_p) for name in ("means2d", "covariances", "opacities", "features", "slants", "magnitudes")
+    )
+
+
 STRUCTURES = (
     SplatStream,
     SplatDevice,
@@ -158,15 +232,28 @@ STRUCTURES = (
     SplatStep,
     SplatAdam,
     SplatSky,
+    SplatActivated,
+    SplatActivatedGradients,
+    SplatProjectOptions,
+    SplatProjected,
+    SplatProjectedGradients,
+    SplatShRows,
+    SplatFeatures,
+    SplatFeaturePictures,
+    SplatFeaturePictureGradients,
+    SplatFeatureGradients,
 )
 
 _SHOT, _ROWS, _FRAME, _ON = POINTER(SplatShot), POINTER(SplatRows), POINTER(SplatFrame), POINTER(SplatStream)
 _RENDER = (_SHOT, _ROWS, _FRAME)
+_PROJECT = (_SHOT, POINTER(SplatProjectOptions), POINTER(SplatActivated))
+_BLEND = (_SHOT, POINTER(SplatFeatures), _FRAME)
 _DRAW = (c_uint64, c_uint64, c_uint64)
 
 SIZES: dict[str, tuple[Any, ...]] = {
     "splat_frame_bytes": (_SHOT, c_int64, c_int64),
     "splat_back_bytes": (_SHOT, c_int64, c_int64),
+    "splat_feature_back_bytes": (_SHOT, c_int64, c_int64, c_int32),
     "splat_loss_bytes": (c_int32, c_int32),
     "splat_affine_bytes": (c_int64,),
 }
@@ -177,6 +264,18 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "splat_blend_backward": (*_RENDER, POINTER(SplatPictureGradients), _ON),
     "splat_project_backward": (*_RENDER, _ROWS, c_void_p, _ON),
     "splat_step": (_SHOT, _FRAME, POINTER(SplatStep), c_void_p, _ON),
+    "splat_project_activated": (*_PROJECT, POINTER(SplatProjected), _ON),
+    "splat_project_activated_backward": (
+        *(*_PROJECT, c_void_p, POINTER(SplatProjectedGradients)),
+        *(POINTER(SplatActivatedGradients), _ON),
+    ),
+    "splat_sh_colours": (_SHOT, POINTER(SplatShRows), c_void_p, _ON),
+    "splat_sh_colours_backward": (_SHOT, POINTER(SplatShRows), c_void_p, c_void_p, c_void_p, _ON),
+    "splat_blend_features": (*_BLEND, POINTER(SplatFeaturePictures), _ON),
+    "splat_blend_features_backward": (
+        *(*_BLEND, POINTER(SplatFeaturePictureGradients)),
+        *(POINTER(SplatFeatureGradients), _ON),
+    ),
     "splat_photo_loss": (
         *(c_void_p, c_void_p, c_void_p, c_int32, c_int32, POINTER(SplatRectangle), c_double),
         *(c_void_p, c_void_p, c_void_p, c_int64, _ON),

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 
+import activated_scenes
 import pytest
 import torch
+from activated_scenes import Case, options
 from building import build_on_cpu, load
 from on_cpu import kernels_on_cpu
 from random_scene import random_camera, random_scene
@@ -43,6 +45,10 @@ def use_all(kernels: CudaKernels) -> None:
             Adam(scene.tensors()).step(scene.tensors(), rates, rendered.visible, None if finished else buffers)
             for tensor in scene.tensors().values():
                 tensor.grad = None
+    case = Case(20, 5, options=options(rasterize_mode="antialiased"))
+    with use_kernels(kernels):
+        activated_scenes.render(case)
+        activated_scenes.render(Case(20, options=options(sh_degree=1)))
     draw = (1, 2, 3)
     kernels.uniform(*draw, 5)
     kernels.split_offsets(draw, torch.tensor([2, 7]), scene.log_scales.detach(), scene.quats.detach())

@@ -186,6 +186,8 @@ def test_its_parts_measure_what_they_are_to_measure(first: Visited) -> None:
     assert first.rows("the card")[0]["driver_version"] == "580.159.04"
     assert first.rows("smoke")[0]["psnr_db"] >= gpu_proofs.MIN_DB
     assert len(first.rows("agreement with the CPU")) == 4
+    assert [row["same"] for row in first.rows("features")] == [True] * 3
+    assert [row["channels"] for row in first.rows("features, middle") if row["features_ms"] > 0.0] == [None, 3, 32]
     assert [(row["of"], row["found"]) for row in first.rows("memcheck")] == [("every_kernel", 0)]
     for name, scene, count in (("few, made", "made", gpu_visit.TOY.few), ("trained scene", "trained", 150)):
         whole, alone = first.rows(name)

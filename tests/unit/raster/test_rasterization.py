@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 import torch
+from activated_scenes import LEAVES, Case, Outcome, arguments, differentiate, leaves_of, options, render
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
@@ -17,63 +17,7 @@ from splatpipe.pipeline.raster.rasterization import rasterization
 LEAST_DB = 60.0  # of an image, its peak the largest value expected, at least 1
 GRADIENT = 1e-4  # L2, relative, float32 with the kernels against float64
 NO_GRADIENT = 1e-6  # anything smaller is rounding
-LEAVES = ("means", "quats", "scales", "opacities", "colors")
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-
-
-@dataclass(frozen=True)
-class Case:
-    """What to render; other arguments of ``rasterization`` in ``options``."""
-
-    count: int = 40
-    channels: int = 3
-    views: int = 1
-    per_view: bool = False
-    width: int = 41
-    height: int = 27
-    seed: int = 1
-    behind: bool = False
-    options: tuple[tuple[str, Any], ...] = field(default=())
-
-    def option(self, name: str, default: Any) -> Any:
-        return dict(self.options).get(name, default)
-
-
-def arguments(case: Case, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Random Gaussians before turned and moved cameras: some out of view, two opaque, two not there at all."""
-    generator = torch.Generator().manual_seed(case.seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    n, c = case.count, case.views
-    means = normal(n, 3) * torch.tensor([1.6, 1.2, 1.0]) + torch.tensor([0.0, 0.0, 4.0])
-    if case.behind:
-        means[:, 2] = -2.0
-    opacities = torch.rand(n, generator=generator, dtype=torch.float64)
-    opacities[:2], opacities[2:4] = 1.0, 0.0
-    degree = case.option("sh_degree", None)
-    of_colors = (case.channels,) if degree is None else (16, 3)
-    colors = normal(*((c,) if case.per_view else ()), n, *of_colors)  # of either sign
-    viewmats, ks = torch.eye(4, dtype=torch.float64).repeat(c, 1, 1), torch.eye(3, dtype=torch.float64).repeat(c, 1, 1)
-    for view in range(c):
-        turn = normal(3, 3) * 0.1
-        viewmats[view, :3, :3] = torch.matrix_exp(turn - turn.T)
-        viewmats[view, :3, 3] = normal(3) * 0.2
-        ks[view, 0, 0], ks[view, 1, 1] = 40.0 + 3.0 * view, 43.0
-        ks[view, 0, 2], ks[view, 1, 2] = 0.45 * case.width, 0.55 * case.height
-    tensors = {
-        "means": means,
-        "quats": normal(n, 4),
-        "scales": torch.exp(normal(n, 3) * 0.4 - 1.5),
-        "opacities": opacities,
-        "colors": colors,
-        "viewmats": viewmats,
-        "Ks": ks,
-    }
-    if case.option("render_mode", "RGB") not in ("D", "ED"):
-        tensors["backgrounds"] = normal(c, 3 if degree is not None else case.channels)
-    return {name: tensor.to(torch.float32).to(dtype) for name, tensor in tensors.items()}  # both of the same numbers
 
 
 def oracle(case: Case, given: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -134,43 +78,10 @@ def composite(
     return image + left[..., None] * behind, 1.0 - left[..., None]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Images, alpha, and the gradients of a weighted sum of both."""
-
-    images: Tensor
-    alphas: Tensor
-    gradients: dict[str, Tensor]
-
-
-def differentiate(given: dict[str, Tensor], images: Tensor, alphas: Tensor) -> Outcome:
-    generator = torch.Generator().manual_seed(5)
-    total = images.new_zeros(())
-    for picture in (images, alphas):
-        total = total + (picture * torch.randn(picture.shape, generator=generator, dtype=torch.float64)).sum()
-    leaves = [given[name] for name in LEAVES]
-    gradients = (
-        torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
-        if total.requires_grad
-        else [torch.zeros_like(leaf) for leaf in leaves]
-    )
-    return Outcome(images.detach(), alphas.detach(), dict(zip(LEAVES, gradients, strict=True)))
-
-
-def leaves_of(given: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor.requires_grad_(name in LEAVES) for name, tensor in given.items()}
-
-
 @functools.cache
 def expected(case: Case) -> Outcome:
     given = leaves_of(arguments(case, torch.float64))
     return differentiate(given, *oracle(case, given))
-
-
-def render(case: Case, dtype: torch.dtype = torch.float32) -> Outcome:
-    given = leaves_of(arguments(case, dtype))
-    images, alphas, _ = rasterization(**given, width=case.width, height=case.height, **dict(case.options))
-    return differentiate(given, images, alphas)
 
 
 def compare(case: Case, dtype: torch.dtype = torch.float32, gradient: float = GRADIENT) -> None:
@@ -183,10 +94,6 @@ def compare(case: Case, dtype: torch.dtype = torch.float32, gradient: float = GR
     for name, truth in exact.gradients.items():
         error = float((ours.gradients[name] - truth).norm() / truth.norm().clamp_min(NO_GRADIENT))
         assert error < gradient, f"gradient of {name}: {error:.1e}"
-
-
-def options(**named: Any) -> tuple[tuple[str, Any], ...]:
-    return tuple(named.items())
 
 
 @pytest.mark.usefixtures("isa")
