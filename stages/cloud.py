@@ -11,7 +11,7 @@ from splatpipe.pipeline.surface.ground.point_classes import PointClassifier
 from splatpipe.pipeline.surface.heights.surface_file import open_surface
 from splatpipe.pipeline.surface.options import CloudConfig
 from splatpipe.pipeline.surface.rasters.grid import make_grid
-from splatpipe.pipeline.surface.shapes.dense_cloud import CloudTask, Classify, make_cloud
+from splatpipe.pipeline.surface.shapes.dense_cloud import Classify, CloudTask, make_cloud
 
 
 def run(config: CloudConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:

@@ -1,6 +1,6 @@
 """A made site on a slope of 40 %, with errors like those of the demo's depths: its surface model, cloud and truth.
 
-A level plot is cut into the slope behind a retaining wall and filled in front with a bank. A house stands on it, another
+A level plot is cut into the slope, with a retaining wall behind it and a bank in front. A house stands on it, another
 one on the slope itself; there are trees, a hedge, a car, and bushes. Nothing is seen under roofs, little under crowns.
 """
 
@@ -158,10 +158,8 @@ def _walls(house: tuple[float, ...], gsd_m: float, rng: np.random.Generator) -> 
     ground = float(terrain_height(np.array((west + right) / 2.0), np.array((south + top) / 2.0)))
     step = WALL_STEP_GSD * gsd_m
     walls = []
-    for x0, y0, x1, y1 in ((west, south, right, south), (west, top, right, top)) + (
-        (west, south, west, top),
-        (right, south, right, top),
-    ):
+    a, b, c, d = (west, south), (right, south), (right, top), (west, top)
+    for (x0, y0), (x1, y1) in ((a, b), (d, c), (a, d), (b, c)):
         length = np.hypot(x1 - x0, y1 - y0)
         along, up = np.meshgrid(np.arange(0.0, length, step) / length, np.arange(0.0, 2.0 * eaves, step))
         east, north = x0 + (x1 - x0) * along.ravel(), y0 + (y1 - y0) * along.ravel()

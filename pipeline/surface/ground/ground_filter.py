@@ -15,7 +15,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float64
+
+from splatpipe.pipeline.surface.ground.membrane import fill_membrane
+from splatpipe.pipeline.surface.ground.trend import site_trend
 
 Cells = Float64[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
@@ -26,12 +29,12 @@ RISE = 0.1  # height over half width from which something is an object, over the
 NOISE_GSD = 4.0  # height differences up to this are noise: 95 % of heights are within 3 GSD
 STEP_SLOPE = 1.0  # steeper than 45°, there is no way from a patch to the next: earth stands less steeply
 MIN_GROUND_SHARE = 0.3  # of a patch, that has to be left by the windows
-TREND_M = 15.0  # blocks of the trend
-TREND_SHARE = 0.1  # quantile of a block's heights that stands for its ground
 PIT_M, PIT_M2 = 1.2, 1.0  # half width and area up to which a pit is noise
 LOW_OBJECT_M, LOW_OBJECT_M2 = 3.0, 30.0  # half width and area up to which something lower than a step is an object,
 EDGE_SHARE, EDGE_SLOPE = 0.6, 0.25  # if this share of its edge is steeper than this: the rest is a hump of the ground
-GROWTH_CELLS, GROWTH_SLOPE = 4, 0.3  # into steps, from both sides; over the trend
+GROWTH_CELLS = 4  # into steps, from both sides
+GROWTH_DOWN, GROWTH_UP = 0.3, 0.15  # slopes over the trend: what rises is more often an object's foot
+SURE_NEIGHBOURS, SURE_M2 = 6, 4.0  # of eight, and area of cells with so many: what else is ground must not rise
 
 
 @dataclass(frozen=True)
@@ -73,58 +76,11 @@ def find_ground(height: Cells, scale: GroundScale) -> Mask:
     clean = np.where(_pits(height, scale), np.nan, height)
     if not np.isfinite(clean).any():
         return np.zeros(height.shape, np.bool_)
-    over = clean - site_trend(clean, scale)
+    over = clean - site_trend(clean, scale.cell_m)
     left = _left_by_windows(over, scale)
     objects = _low_objects(over, scale)
-    return _grown(_whole_patches(clean, left, scale) & ~objects, over, scale) & ~objects
-
-
-def site_trend(height: Cells, scale: GroundScale) -> Cells:
-    """A smooth surface that follows slopes and hills, not buildings: low quantiles of blocks, without peaks."""
-    side = scale.cells(TREND_M)
-    rows, columns = (max(1, math.ceil(length / side)) for length in height.shape)
-    wide = np.full((rows * side, columns * side), np.nan)
-    wide[: height.shape[0], : height.shape[1]] = height
-    blocks = np.sort(wide.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows, columns, -1), axis=2)
-    count = np.isfinite(blocks).sum(axis=2)
-    rank = np.floor(TREND_SHARE * np.maximum(count - 1, 0)).astype(np.int64)
-    low = np.take_along_axis(blocks, rank[..., None], 2)[..., 0]
-    known = count > side * side // 10
-    if not known.any():
-        return np.full(height.shape, float(np.nanmedian(height)))
-    plane = _plane(low, known)
-    off = _opened(np.where(known, low - plane, np.nan), 1)
-    off = _filled_by_means(off)
-    smooth = (
-        cv2.GaussianBlur(off + plane, (0, 0), 1.0, borderType=cv2.BORDER_REFLECT) if min(off.shape) > 1 else off + plane
-    )
-    # Bilinear between the blocks' middles, linear beyond the outer ones.
-    y = (np.arange(height.shape[0]) + 0.5) / side - 0.5
-    x = (np.arange(height.shape[1]) + 0.5) / side - 0.5
-    at = np.clip(x, 0, columns - 1).astype(np.float32)[None].repeat(len(y), 0)
-    down = np.clip(y, 0, rows - 1).astype(np.float32)[:, None].repeat(len(x), 1)
-    beyond = _plane_at(low, known, y, x) - _plane_at(low, known, down[:, 0], at[0])
-    return cv2.remap(smooth, at, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) + beyond
-
-
-def _plane(low: Cells, known: Mask) -> Cells:
-    rows, columns = low.shape
-    return _plane_at(low, known, np.arange(rows), np.arange(columns))
-
-
-def _plane_at(low: Cells, known: Mask, y: np.ndarray, x: np.ndarray) -> Cells:
-    """The least-squares plane through known blocks, at rows and columns."""
-    row, column = np.nonzero(known)
-    terms = np.column_stack([np.ones(len(row)), row, column])
-    least = np.linalg.lstsq(terms, low[known], rcond=1e-6)[0]
-    return np.asarray(least[0] + least[1] * np.asarray(y)[:, None] + least[2] * np.asarray(x)[None])
-
-
-def _filled_by_means(values: Cells) -> Cells:
-    """Unknown blocks filled from known ones around."""
-    from splatpipe.pipeline.surface.ground.membrane import fill_membrane
-
-    return fill_membrane(values)
+    grown = _grown(_whole_patches(clean, left, scale) & ~objects, over, scale) & ~objects
+    return _without_feet(grown, over, scale)
 
 
 def _pits(height: Cells, scale: GroundScale) -> Mask:
@@ -210,10 +166,28 @@ def _grown(ground: Mask, over: Cells, scale: GroundScale) -> Mask:
         weight = cv2.filter2D(ground.astype(np.float64), -1, near, borderType=cv2.BORDER_CONSTANT)
         total = cv2.filter2D(np.where(ground, over, 0.0), -1, near, borderType=cv2.BORDER_CONSTANT)
         mean = total / np.maximum(weight, 1.0)
+        rise = over - mean
         with np.errstate(invalid="ignore"):
-            like = np.abs(over - mean) <= scale.noise_m + GROWTH_SLOPE * scale.cell_m
+            low = rise <= scale.noise_m / 2.0 + GROWTH_UP * scale.cell_m
+            like = low & (rise >= -scale.noise_m - GROWTH_DOWN * scale.cell_m)
         new = ~ground & (weight >= 2.0) & like
         if not new.any():
             break
         ground = ground | new
     return ground
+
+
+def _without_feet(ground: Mask, over: Cells, scale: GroundScale) -> Mask:
+    """Ground without the feet of objects, and without scraps, that rise over what is surely ground around them."""
+    around = np.ones((3, 3), np.float64)
+    count = cv2.filter2D(ground.astype(np.float64), -1, around, borderType=cv2.BORDER_REFLECT) - ground
+    core = ground & (count >= SURE_NEIGHBOURS)
+    _, parts, facts, _ = cv2.connectedComponentsWithStats(core.astype(np.uint8), connectivity=4)
+    large = facts[:, cv2.CC_STAT_AREA] * scale.cell_m**2 >= SURE_M2
+    large[0] = False
+    sure = np.asarray(large[parts])
+    if not sure.any():
+        return ground
+    level = fill_membrane(np.where(sure, over, np.nan))
+    with np.errstate(invalid="ignore"):
+        return ground & (sure | (over - level <= scale.noise_m / 2.0))

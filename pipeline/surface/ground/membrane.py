@@ -37,14 +37,14 @@ def fill_membrane(height: Cells) -> Cells:
     return _from_coarse(height, fill_membrane(_halved(height)))
 
 
-def shrink(height: Cells) -> Cells:
+def shrink(height: Cells) -> Float64[np.ndarray, "r c"]:
     """Means of the known cells, on the coarse level; NaN where there is none."""
     for _ in range(LEVELS):
         height = _halved(height)
     return height
 
 
-def fill_window(height: Cells, coarse: Cells) -> Cells:
+def fill_window(height: Cells, coarse: Float64[np.ndarray, "r c"]) -> Cells:
     """Fill a window of a raster; further than ``REACH`` from its borders as if the raster was filled as a whole.
 
     Args:
@@ -60,12 +60,12 @@ def fill_window(height: Cells, coarse: Cells) -> Cells:
     return filled
 
 
-def _from_coarse(height: Cells, coarse: Cells) -> Cells:
+def _from_coarse(height: Cells, coarse: Float64[np.ndarray, "r c"]) -> Cells:
     known = np.isfinite(height)
     return _relaxed(np.where(known, height, _enlarged(coarse, height.shape)), ~known)
 
 
-def _halved(height: Cells) -> Cells:
+def _halved(height: Cells) -> Float64[np.ndarray, "r c"]:
     """Means of the known cells in blocks of two by two."""
     rows, columns = (side + side % 2 for side in height.shape)
     wide = np.full((rows, columns), np.nan)
@@ -77,7 +77,7 @@ def _halved(height: Cells) -> Cells:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _enlarged(coarse: Cells, shape: tuple[int, ...]) -> Cells:
+def _enlarged(coarse: Cells, shape: tuple[int, ...]) -> Float64[np.ndarray, "r c"]:
     """Cells of half the size, interpolated linearly."""
     rows, columns = coarse.shape
     fine = cv2.resize(coarse, (2 * columns, 2 * rows), interpolation=cv2.INTER_LINEAR)

@@ -95,7 +95,7 @@ class PointClassifier:
         return HeightField(lattice, heights).at(east, -south)
 
     def _tops(self, part: Tile, radius: int) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-        """Heights of the topmost surface, and of roofs, around each cell, metres; minus infinity where there is none."""
+        """Heights of the topmost surface (infinite where unknown), and of roofs (minus infinity), metres."""
         heights = self.surface.heights(part) * self.grid.crs.height_unit_m
         is_roof = self.cover.heights(part) == BUILDING
         around = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)

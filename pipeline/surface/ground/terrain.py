@@ -165,12 +165,12 @@ def _near_ground(low: Cells, ground: Mask, noise_m: float) -> tuple[Cells, Cells
     return np.where(np.isfinite(lowest), lowest, np.nan), np.where(np.isfinite(highest), highest, np.nan)
 
 
-def _coarse_window(coarse: Cells, window: Tile) -> Cells:
+def _coarse_window(coarse: Cells, window: Tile) -> Float64[np.ndarray, "r c"]:
     row, column = window.row // SHRUNK, window.column // SHRUNK
     return coarse[row : row + -(-window.height // SHRUNK), column : column + -(-window.width // SHRUNK)]
 
 
-def _enlarged(blocks: Cells, inside: tuple[slice, slice], side: int) -> Cells:
+def _enlarged(blocks: Cells, inside: tuple[slice, slice], side: int) -> Float64[np.ndarray, "r c"]:
     """Values of some blocks for their cells, interpolated linearly between the blocks' middles."""
     rows, columns = inside
     wide = np.pad(blocks, 1, mode="edge")[rows.start : rows.stop + 2, columns.start : columns.stop + 2]
