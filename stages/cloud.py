@@ -7,6 +7,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.stage import Inputs, Reporter, Summary
 from splatpipe.pipeline.surface.depths.run_sources import RunSurface, open_surveyed
 from splatpipe.pipeline.surface.depths.site_extent import SiteExtent
+from splatpipe.pipeline.surface.ground.dtm import noise_gsd
 from splatpipe.pipeline.surface.ground.point_classes import PointClassifier
 from splatpipe.pipeline.surface.heights.surface_file import open_surface
 from splatpipe.pipeline.surface.options import CloudConfig
@@ -39,4 +40,4 @@ def _classifier(inputs: Inputs, surface: RunSurface, site: SiteExtent, cell_m: f
         return None
     grid = make_grid(surface.frame, site.box, cell_m)
     rasters = (open_surface(path) for path in (inputs["dsm.files"] / "dsm.tif", terrain, cover))
-    return PointClassifier(*rasters, grid, site.gsd_m).classify
+    return PointClassifier(*rasters, grid, noise_gsd(site.gsd_m, grid)).classify

@@ -26,6 +26,7 @@ from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
 CLASSES = 256  # of the cover, at most
+CELL_GSD = 2.0  # cell of a surface model over the GSD, unless depths are coarser
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,13 @@ class DtmTask:
 
     def source(self) -> TerrainSource:
         """The surface model in metres."""
-        return TerrainSource(self.surface, self.grid.cell_m, self.grid.crs.height_unit_m, self.gsd_m)
+        gsd_m = noise_gsd(self.gsd_m, self.grid)
+        return TerrainSource(self.surface, self.grid.cell_m, self.grid.crs.height_unit_m, gsd_m)
+
+
+def noise_gsd(gsd_m: float, grid: Grid) -> float:
+    """The GSD that the noise of heights follows from: the photos', or, for coarser depths, half a cell."""
+    return max(gsd_m, grid.cell_m / CELL_GSD)
 
 
 def make_dtm(task: DtmTask, work: Path, out: Path, cover: Path, report: Reporter) -> dict[str, Any]:

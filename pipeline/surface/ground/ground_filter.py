@@ -5,7 +5,8 @@
    (opening with growing windows; Zhang et al., "A progressive morphological filter for removing nonground measurements
    from airborne LIDAR data", IEEE TGRS 41, 2003), over the site's trend, so that a slope is like a plane.
 3. Windows cut off hill tops and terraces, too. So cells are joined to patches between which there are steps: a patch of
-   which enough is left is ground as a whole, and the rest are objects. A dune has no step around it, a roof has.
+   which enough is left is ground as a whole, except for pieces that the windows cut off and from which it goes down
+   steeply nearly all around. A dune has no step around it; a roof has, with a gap perhaps where a tree leans on it.
 """
 
 from __future__ import annotations
@@ -78,8 +79,9 @@ def find_ground(height: Cells, scale: GroundScale) -> Mask:
         return np.zeros(height.shape, np.bool_)
     over = clean - site_trend(clean, scale.cell_m)
     left = _left_by_windows(over, scale)
-    objects = _low_objects(over, scale)
-    grown = _grown(_whole_patches(clean, left, scale) & ~objects, over, scale) & ~objects
+    patches = _whole_patches(clean, left, scale)
+    objects = _low_objects(over, scale) | _steep_pieces(patches & ~left, over, scale)
+    grown = _grown(patches & ~objects, over, scale) & ~objects
     return _without_feet(grown, over, scale)
 
 
@@ -148,13 +150,18 @@ def _low_objects(over: Cells, scale: GroundScale) -> Mask:
             break
         with np.errstate(invalid="ignore"):
             cut |= over - _opened(over, radius) > scale.noise_m + RISE * radius * scale.cell_m
-    count, parts, facts, _ = cv2.connectedComponentsWithStats(cut.astype(np.uint8), connectivity=8)
+    return _steep_pieces(cut, over, scale, LOW_OBJECT_M2)
+
+
+def _steep_pieces(cut: Mask, over: Cells, scale: GroundScale, largest_m2: float = math.inf) -> Mask:
+    """Pieces that windows have cut off and from whose edge it goes down steeply nearly all around."""
+    count, parts, facts, _ = cv2.connectedComponentsWithStats(cut.astype(np.uint8), connectivity=4)
     border = cut & (cv2.erode(cut.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) == 0)
     beside = cv2.erode(np.where(cut | np.isnan(over), np.inf, over), np.ones((5, 5), np.uint8), borderValue=np.inf)
     with np.errstate(invalid="ignore"):
         steep = border & (over - beside > scale.noise_m + EDGE_SLOPE * 2.0 * scale.cell_m)
     edges, steep_edges = (np.bincount(parts[mask], minlength=count) for mask in (border, steep))
-    objects = (facts[:, cv2.CC_STAT_AREA] * scale.cell_m**2 <= LOW_OBJECT_M2) & (steep_edges >= EDGE_SHARE * edges)
+    objects = (facts[:, cv2.CC_STAT_AREA] * scale.cell_m**2 <= largest_m2) & (steep_edges >= EDGE_SHARE * edges)
     objects[0] = False
     return np.asarray(objects[parts])
 

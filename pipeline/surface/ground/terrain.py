@@ -45,7 +45,7 @@ class TerrainSource:
         surface: Its files.
         cell_m: Cell size on the ground, metres.
         height_unit_m: Unit of the heights, metres.
-        gsd_m: GSD of the photos, metres.
+        gsd_m: GSD of the photos, or of depths that are coarser than half the cells, metres.
     """
 
     surface: SurfaceFile
@@ -144,8 +144,7 @@ class TerrainSteps:
         there &= np.isfinite(unblocked(filled[inside], side))
         terrain = np.where(ground, heights, _enlarged(filled, inside, side))
         distance = np.where(ground, 0.0, np.maximum(_enlarged(away, inside, side), source.cell_m / 2.0))
-        usual = float(np.nanmedian(sigmas[ground])) if (ground & np.isfinite(sigmas)).any() else source.gsd_m
-        deviation = np.where(ground & np.isfinite(sigmas), sigmas, np.hypot(usual, DEVIATION_SHARE * distance))
+        deviation = np.where(ground & np.isfinite(sigmas), sigmas, np.hypot(source.gsd_m, DEVIATION_SHARE * distance))
         cover = np.where(ground, GROUND, np.where(unblocked(roofs[inside], side), BUILDING, OTHER))
         unit_m = source.height_unit_m
         over = np.maximum(heights - terrain, 0.0)
