@@ -14,7 +14,7 @@ CELL_GSD = 2.0  # times the photos' GSD: heights are known less finely than colo
 
 
 def run(config: DsmConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
-    """Write `files/` (dsm.tif, dsm_confidence.tif, contours) and `site.json`; no files if there are no usable depths.
+    """Write `files/` (dsm.tif, dsm_confidence.tif) and `site.json`; no files if there are no usable depths.
 
     Raises:
         SplatpipeError: if the grid would be absurdly large, or an input is broken.

@@ -9,7 +9,7 @@ from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, FacadesConfig, MeshConfig, OrthoConfig
+from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, DtmConfig, FacadesConfig, MeshConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
@@ -283,11 +283,21 @@ SURFACE_READS = (
 )
 DSM = Stage(
     "dsm",
-    version=2,
+    version=3,
     config=DsmConfig,
     reads=SURFACE_READS,
     parts={"files": "files", "site": "site.json"},
     entry="splatpipe.stages.dsm:run",
+    resumable=True,
+    deliverables=("files",),
+)
+DTM = Stage(
+    "dtm",
+    version=1,
+    config=DtmConfig,
+    reads=("dsm.files", "dsm.site", "georef.frame"),
+    parts={"files": "files", "cover": "cover"},
+    entry="splatpipe.stages.dtm:run",
     resumable=True,
     deliverables=("files",),
 )
@@ -313,9 +323,9 @@ FACADES = Stage(
 )
 CLOUD = Stage(
     "cloud",
-    version=3,
+    version=4,
     config=CloudConfig,
-    reads=("dsm.site", *SURFACE_READS),
+    reads=("dsm.site", "dsm.files", "dtm.files", "dtm.cover", *SURFACE_READS),
     parts={"files": "files"},
     entry="splatpipe.stages.cloud:run",
     resumable=True,
@@ -352,6 +362,7 @@ LINE = (
     DEPTHS,
     SPLAT_DEPTHS,
     DSM,
+    DTM,
     ORTHO,
     FACADES,
     CLOUD,

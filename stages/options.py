@@ -9,7 +9,7 @@ from splatpipe.pipeline.mvs.options import DepthsConfig, InitializeConfig
 from splatpipe.pipeline.photos.options import IngestConfig, SplitConfig, UndistortConfig
 from splatpipe.pipeline.render.options import EvaluateConfig
 from splatpipe.pipeline.sfm.options import FeaturesConfig, MatchesConfig, SparseConfig
-from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, FacadesConfig, MeshConfig, OrthoConfig
+from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, DtmConfig, FacadesConfig, MeshConfig, OrthoConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
@@ -38,6 +38,7 @@ class LineConfig(StageConfig):
     depths: DepthsConfig = DepthsConfig()
     splat_depths: SplatDepthsConfig = SplatDepthsConfig()
     dsm: DsmConfig = DsmConfig()
+    dtm: DtmConfig = DtmConfig()
     ortho: OrthoConfig = OrthoConfig()
     facades: FacadesConfig = FacadesConfig()
     cloud: CloudConfig = CloudConfig()

@@ -9,16 +9,17 @@ from splatpipe.pipeline.engine.errors import UsageError
 CELL_PIXELS = 2.0  # orthophoto pixels per DSM cell side if the user sets the pixel size
 NEEDS = {
     "dsm": ("depths",),
+    "dtm": ("depths", "dsm"),
     "ortho": ("depths", "dsm"),
     "facades": ("depths", "dsm"),
-    "cloud": ("depths", "dsm"),
+    "cloud": ("depths", "dsm", "dtm"),
     "mesh": ("depths", "dsm"),
 }
 """Products, and the stages that each needs in addition to its own."""
 
 SOURCES = {"photos": (True, False), "splat": (False, True), "both": (True, True)}
 """Whether depths are computed from the photos, and whether they are rendered from the splat."""
-USUAL = "ortho,dsm"
+USUAL = "ortho,dsm,dtm"
 
 NO_PRODUCTS: dict[str, Any] = {stage: {"enabled": False} for stage in ("depths", *NEEDS)}
 # Least time for a whole run with products; a shorter one is spent on the splat, and they can be made later.

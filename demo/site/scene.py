@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from splatpipe.demo.site.house import EAVES, HALF_LENGTH, HALF_WIDTH, RIDGE, add_house
-from splatpipe.demo.site.mesh import Array, Builder, Plane, TexturedMesh, paint_faces
-from splatpipe.demo.site.surroundings import add_surroundings
+from splatpipe.demo.site.mesh import Array, Builder, Face, Plane, TexturedMesh, paint_faces
+from splatpipe.demo.site.surroundings import add_foliage, add_surroundings
 from splatpipe.demo.site.textures import Painter, target
 
 SEED = 20261120
@@ -109,7 +110,17 @@ def building_corners(paint: Painter | None = None) -> Array:
     """
     builder = Builder()
     add_house(builder)
-    faces = [face for face in builder.faces if paint is None or face.paint is paint]
+    return _corners_of([face for face in builder.faces if paint is None or face.paint is paint])
+
+
+def foliage_corners() -> Array:
+    """The corners of the triangles of hedges, bushes and trees, (m, 3, 3), as in the scene."""
+    builder = Builder()
+    add_foliage(builder)
+    return _corners_of(builder.faces)
+
+
+def _corners_of(faces: Sequence[Face]) -> Array:
     corners = np.concatenate([face.vertices[face.triangles] for face in faces])
     turned = corners.astype(np.float32).astype(np.float64) @ _turn(PLOT_YAW_DEG).T
     return np.asarray(turned.astype(np.float32), np.float64)

@@ -272,7 +272,11 @@ def _borders(b: Builder) -> None:
     for start in np.arange(-15.4, 17.0, 2.5):  # fence panels
         b.box(WORLD, (17.0, start, 0.05), (17.06, start + 2.42, 1.6), FENCE)
         b.box(WORLD, (16.96, start - 0.1, 0.0), (17.1, start, 1.75), FENCE)
-    for k, y in enumerate(np.arange(-12.5, 16.0, 4.6)):  # hedge
+    _hedges(b)
+
+
+def _hedges(b: Builder) -> None:
+    for k, y in enumerate(np.arange(-12.5, 16.0, 4.6)):
         _foliage(b, (-17.0, y, 0.75), (0.75, 2.45, 1.0), 400 + k, "oak", 5, 8.0)
     for k, x in enumerate(np.arange(-14.5, 16.0, 4.8)):
         _foliage(b, (x, 17.2, 0.8), (2.55, 0.8, 1.1), 430 + k, "oak" if k % 2 else "birch", 5, 8.0)
@@ -386,6 +390,12 @@ def _facade(b: Builder, plane: Plane, size: tuple[float, float, float, float], s
                 b.box(wall, (left - 0.1, low - 0.1, 0.0), (left + 1.2, low + 1.4, 0.06), painted("dedbd2"))
                 room = interior("57606b", ("c9a27c", "e3ddd0", "a9b7bf")[(k + seed) % 3])
                 b.rect(wall.at(0, 0, 0.07), (left, low), (left + 1.1, low + 1.3), room)
+
+
+def add_foliage(b: Builder) -> None:
+    """Add hedges, bushes and trees."""
+    _hedges(b)
+    _trees(b)
 
 
 def add_surroundings(b: Builder, seed: int) -> None:

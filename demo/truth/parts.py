@@ -9,11 +9,11 @@ from jaxtyping import Float64, Int8
 
 from splatpipe.demo import CAPTURE
 from splatpipe.demo.site.house import BRICK, CREAM, NORTH_PLASTER, SHEET, SLATE, TILES
-from splatpipe.demo.site.scene import building_corners
+from splatpipe.demo.site.scene import building_corners, foliage_corners
 from splatpipe.demo.truth.truth import Triangles
 
-OTHER, GROUND, HOUSE, TILED, SLATED, SHEETED, PLAIN, BRICKS = range(8)
-NAMES = ("others", "ground", "house", "tiles", "slates", "metal roof", "plain walls", "bricks")
+OTHER, GROUND, HOUSE, TILED, SLATED, SHEETED, PLAIN, BRICKS, FOLIAGE = range(9)
+NAMES = ("others", "ground", "house", "tiles", "slates", "metal roof", "plain walls", "bricks", "foliage")
 PAINTS = {TILED: TILES, SLATED: SLATE, SHEETED: SHEET, BRICKS: BRICK}
 PLASTERS = (CREAM, NORTH_PLASTER)
 GROUND_M = 0.02  # targets lie 12 mm above the plot, which is level and at 0
@@ -32,8 +32,9 @@ def parts_of(triangles: Triangles) -> Int8[np.ndarray, " m"]:
     parts = np.full(len(triangles), OTHER, np.int8)
     up = unit_normals(triangles)[:, 2]
     heights = triangles[..., 2]
-    parts[(np.abs(heights) < GROUND_M).all(axis=1) & (np.abs(up) > FLAT)] = GROUND
     rows = {key: row for row, key in enumerate(_keys(triangles))}
+    parts[_rows(rows, foliage_corners())] = FOLIAGE
+    parts[(np.abs(heights) < GROUND_M).all(axis=1) & (np.abs(up) > FLAT)] = GROUND
     for part, corners in ((HOUSE, building_corners()), *((p, building_corners(paint)) for p, paint in PAINTS.items())):
         parts[_rows(rows, corners)] = part
     for paint in PLASTERS:

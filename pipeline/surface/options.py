@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from splatpipe.pipeline.engine.ranges import NonNegativeFloat, PositiveInt
 from splatpipe.pipeline.engine.stage import StageConfig
 
 
 class DsmConfig(StageConfig):
     enabled: bool = True
-    """Make the surface model (DSM): dsm.tif, its confidence, contours."""
+    """Make the surface model (DSM): dsm.tif and its confidence."""
     cell_m: NonNegativeFloat = 0.0
     """Cell size on the ground, metres; 0: two pixels of the photos, or one of the depth maps if that is larger."""
+
+
+class DtmConfig(StageConfig):
+    enabled: bool = True
+    """Make the terrain model (DTM), without buildings and trees: dtm.tif, its confidence, heights over the ground
+    (chm.tif); requires the surface model."""
+    contours: Literal["dtm", "dsm"] = "dtm"
+    """Draw contours of the ground (`dtm`), or of the topmost surface (`dsm`), as without a terrain model."""
 
 
 class OrthoConfig(StageConfig):

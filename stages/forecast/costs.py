@@ -119,6 +119,7 @@ STAGES = {
     "depths": StageCosts(12.0, {"depths": 1}, 0.97, 690e6, {}, {"depths": 5e6}),
     "splat_depths": StageCosts(3.0, {"depths": 1}, 0.9, 600e6, {}, {"depths": 5e6}),
     "dsm": StageCosts(0.35, {"pixels": 1}, 0.9, 1000e6, {}, {"pixels": 0.2e6}),
+    "dtm": StageCosts(0.05, {"pixels": 1}, 0.8, 700e6, {}, {"pixels": 0.3e6}),
     "ortho": StageCosts(0.4, {"pixels": 1}, 0.9, 1250e6, {}, {"pixels": 0.5e6}),
     "facades": StageCosts(1.0, {"pixels": 1}, 0.8, 1000e6, {}, {"pixels": 0.2e6}),
     "cloud": StageCosts(2.0, {"pixels": 1}, 0.9, 1500e6, {}, {"pixels": 0.5e6}),

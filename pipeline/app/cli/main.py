@@ -194,8 +194,8 @@ def surface(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="Products to make: ortho, dsm, facades, cloud, mesh; existing ones are kept. Default: ortho,dsm; for "
-            "a section or a volume, dsm.",
+            help="Products to make: ortho, dsm, dtm, facades, cloud, mesh; existing ones are kept. Default: "
+            "ortho,dsm,dtm; for a section or a volume, dsm.",
         ),
     ] = None,
     gsd: Annotated[
@@ -229,7 +229,7 @@ def surface(
     machine: MachineOptions,
     session: SessionOptions,
 ) -> None:
-    """Make surface products of a finished run: orthophoto, surface model, façades, cloud, mesh; sections, volumes."""
+    """Make surface products of a finished run: orthophoto, surface, ground, façades, cloud, mesh; sections, volumes."""
     from splatpipe.pipeline.app.surfaces import MeasurementRequest, check_possible, measure_surface, measurement_lines
     from splatpipe.pipeline.engine.quantities import parse_length
     from splatpipe.stages.products import options_for

@@ -176,6 +176,12 @@ def _dsm(facts: Figures) -> str:
     return f"surface model of {count(facts['area_m2'])} m² in cells of {length(facts['cell_m'])}"
 
 
+def _dtm(facts: Figures) -> str:
+    if not facts["cells"]:
+        return "no terrain model"
+    return f"terrain model, {facts['ground_share']:.0%} of it seen, {facts['building_share']:.0%} under buildings"
+
+
 def _ortho(facts: Figures) -> str:
     if not facts["pixels"]:
         return "no orthophoto"
@@ -216,6 +222,7 @@ SENTENCES: Mapping[str, Callable[[Figures], str]] = {
     "depths": _depths,
     "splat_depths": _depths,
     "dsm": _dsm,
+    "dtm": _dtm,
     "ortho": _ortho,
     "facades": _facades,
     "cloud": _cloud,

@@ -18,8 +18,9 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.engine.files.output_file import new_file
+from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.surface.drawings.dxf import new_document
-from splatpipe.pipeline.surface.heights.contours import Contours
+from splatpipe.pipeline.surface.heights.contours import Contours, trace_contours
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, unit_name
 
@@ -30,6 +31,25 @@ LINE_WEIGHTS = {LAYER: 13, INDEX_LAYER: 35}  # hundredths of a millimetre
 LAYER_COLOURS = {LAYER: 8, INDEX_LAYER: 7}  # AutoCAD's grey; black or white, depending on the background
 DEGREE_DIGITS = 9  # a tenth of a millimetre
 UNIT_DIGITS = 4  # decimals of metres and feet: a tenth of a millimetre, or less
+
+
+def draw_contours(raster: Path, out: Path, grid: Grid, report: Reporter) -> None:
+    """Write `contours.dxf`, and `contours.geojson` if the grid is georeferenced; a warning if there are too many lines.
+
+    Args:
+        raster: Raster with heights.
+        out: Output folder.
+        grid: Its grid.
+        report: Receives the warning.
+    """
+    try:
+        contours = trace_contours(raster)
+    except SplatpipeError as error:
+        report.warning(f"No contours were made: {error.message}", error.hint)
+        return
+    write_dxf(out / "contours.dxf", contours, grid.crs)
+    if grid.crs.world is not None:
+        write_geojson(out / "contours.geojson", contours, grid)
 
 
 def write_geojson(path: Path, contours: Contours, grid: Grid) -> None:

@@ -1,4 +1,4 @@
-"""The digital surface model (DSM) as files: `dsm.tif`, `dsm_confidence.tif`, and contours."""
+"""The digital surface model (DSM) as files: `dsm.tif` and `dsm_confidence.tif`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.surface.depths.run_sources import RunSurface
 from splatpipe.pipeline.surface.depths.site_extent import SiteExtent
 from splatpipe.pipeline.surface.depths.sources import LruCache
-from splatpipe.pipeline.surface.heights.contour_files import write_dxf, write_geojson
-from splatpipe.pipeline.surface.heights.contours import trace_contours
 from splatpipe.pipeline.surface.heights.heights import TILE, HeightInput, surface_heights
 from splatpipe.pipeline.surface.rasters.geotiff import CONFIDENCE, HEIGHTS, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
@@ -88,7 +85,6 @@ def make_dsm(task: DsmTask, work: Path, out: Path, report: Reporter) -> dict[str
 
     making.run(heights)
     sigmas = _write_rasters(making, out, grid)
-    _write_contours(out, grid, report)
     known = int(sigmas.sum())
     typical = int(np.searchsorted(np.cumsum(sigmas), known / 2)) / MILLIMETRES if known else None
     return {
@@ -124,14 +120,3 @@ def _write_rasters(making: SheetWork, out: Path, grid: Grid) -> Int64[np.ndarray
             sigmas += np.bincount(arrays["confidence"][..., 1].ravel(), minlength=len(sigmas))
     sigmas[0] = 0  # cells without a height
     return sigmas
-
-
-def _write_contours(out: Path, grid: Grid, report: Reporter) -> None:
-    try:
-        contours = trace_contours(out / "dsm.tif")
-    except SplatpipeError as error:
-        report.warning(f"No contours were made: {error.message}", error.hint)
-        return
-    write_dxf(out / "contours.dxf", contours, grid.crs)
-    if grid.crs.world is not None:
-        write_geojson(out / "contours.geojson", contours, grid)

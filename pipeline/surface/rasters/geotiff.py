@@ -54,6 +54,7 @@ class RasterForm:
         nodata: Nodata value of all bands; None if there is an alpha band instead.
         packing: Options of GDAL's COG driver.
         has_heights: Whether values are heights in the CRS's unit.
+        over_ground: Whether these heights count from the ground instead of from the CRS's zero.
     """
 
     dtype: str
@@ -61,13 +62,22 @@ class RasterForm:
     nodata: float | None
     packing: tuple[tuple[str, str], ...]
     has_heights: bool = False
+    over_ground: bool = False
 
 
 _DEFLATE = (("COMPRESS", "DEFLATE"), ("PREDICTOR", "YES"), ("LEVEL", "6"))
 _JPEG = (("COMPRESS", "JPEG"), ("QUALITY", str(JPEG_QUALITY)))
 _RGBA = ("red", "green", "blue", "alpha")
 HEIGHTS = RasterForm("float32", ("height",), NODATA_HEIGHT, _DEFLATE, has_heights=True)
+HEIGHTS_OVER_GROUND = RasterForm(
+    "float32", ("height over the ground",), NODATA_HEIGHT, _DEFLATE, has_heights=True, over_ground=True
+)
 CONFIDENCE = RasterForm("uint16", ("photos that confirm the height", "expected deviation, mm"), 0.0, _DEFLATE)
+# 0 is a distance, too: of ground that photos see.
+GROUND_CONFIDENCE = RasterForm(
+    "uint16", ("distance to the nearest ground that photos see, cm", "expected deviation, mm"), 65535.0, _DEFLATE
+)
+COVER = RasterForm("uint8", ("class as in LAS",), 0.0, _DEFLATE)
 COLOURS = RasterForm("uint8", _RGBA, None, _DEFLATE)
 COLOURS_AS_JPEG = RasterForm("uint8", _RGBA, None, _JPEG)
 
@@ -113,7 +123,7 @@ def raster_file(path: Path, grid: Grid, form: RasterForm) -> Iterator[RasterFile
     Args:
         path: Output file.
         grid: Grid of the raster.
-        form: ``HEIGHTS``, ``CONFIDENCE``, ``COLOURS`` or ``COLOURS_AS_JPEG``.
+        form: One of this module's constants.
 
     Raises:
         MachineError: if the disk is full or not writable.
@@ -191,7 +201,7 @@ def _profile(grid: Grid, form: RasterForm) -> dict[str, Any]:
 def _written_crs(grid: Grid, form: RasterForm) -> CRS:
     """The CRS to write: compound for heights, except for a datum by +towgs84, which GDAL loses in a compound CRS."""
     plane = grid.crs.horizontal
-    crs = grid.crs.compound if form.has_heights and not plane.is_bound else plane
+    crs = grid.crs.compound if form.has_heights and not form.over_ground and not plane.is_bound else plane
     return CRS.from_wkt(crs.to_wkt("WKT1_GDAL" if plane.is_engineering else "WKT2_2019"))
 
 
@@ -199,6 +209,7 @@ def _describe(raster: Any, grid: Grid, form: RasterForm) -> None:
     raster.descriptions = form.bands
     if form.has_heights:
         raster.units = (unit_name(grid.crs.height_unit_m),)
+    if form.has_heights and not form.over_ground:
         raster.update_tags(VERTICAL_DATUM=grid.crs.described_heights())
     if form.bands == _RGBA:
         raster.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32, Float64, UInt8
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
@@ -27,7 +28,13 @@ from splatpipe.pipeline.surface.shapes.point_colours import photo_set, point_col
 
 SIDE = 1024  # cells of a part of the plan, in which each photo is read once: some 2 million points; 2048 took 3.2 GB
 TILE = 256  # cells of a tile, in which depths are compared
+CLASSES = 256  # numbers that a class may have
 MARGIN = 3  # cells around a tile from which points may move into it
+
+
+Classify = Callable[
+    [Float64[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"], tuple[float, float], float], UInt8[np.ndarray, " n"]
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +46,15 @@ class CloudTask:
         site: The area that they cover.
         spacing_m: A cube of this side holds at most one point; the photos' GSD, metres.
         threads: Tiles or photos in parallel.
+        classify: Classes of points from their positions and normals, the corner of the cloud's cells (east and north)
+            and the spacing; None leaves all unclassified.
     """
 
     surface: RunSurface
     site: SiteExtent
     spacing_m: float
     threads: int
+    classify: Classify | None = None
 
 
 def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict[str, Any]:
@@ -77,7 +87,8 @@ def make_cloud(task: CloudTask, work: Path, out: Path, report: Reporter) -> dict
             save_arrays(path, **vars(chunk))
         report.progress(done + 1, len(parts), "dense cloud", "parts")
     count = write_cloud(out / "cloud.laz", _load_chunks(work, len(parts)), CloudFrame.of_grid(grid), UNDATED)
-    return {"points": count, "spacing_m": task.spacing_m, "crs": grid.crs.horizontal.name}
+    facts = {"points": count, "spacing_m": task.spacing_m, "crs": grid.crs.horizontal.name}
+    return facts if task.classify is None else {**facts, "classes": _count_classes(work, len(parts))}
 
 
 def _lattice(task: CloudTask) -> Lattice:
@@ -106,7 +117,12 @@ def _part(task: CloudTask, photos: PhotoSet, space: tuple[Lattice, HeightRange],
     colours, known = point_colours(photos, points.pieces, task.spacing_m, task.threads)
     points = points.select(known)  # drop points that moved to where no photo sees them
     positions, normals = (np.ascontiguousarray(each.T) for each in (points.pieces.xyz, points.pieces.normal))
-    return CloudChunk(positions, colours[known], normals.astype(np.float32), points.confidence)
+    directions = normals.astype(np.float32)
+    classes = np.zeros(len(positions), np.uint8)
+    if task.classify is not None:
+        corner = space[0].east_m, space[0].north_m
+        classes = task.classify(positions, directions, corner, task.spacing_m)
+    return CloudChunk(positions, colours[known], directions, points.confidence, classes)
 
 
 def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: HeightRange, tile: Tile) -> FusedPoints:
@@ -114,6 +130,15 @@ def tile_cloud(photos: PhotoSet, lattice: Lattice, relief: HeightRange, tile: Ti
     wide = tile.grown(MARGIN)
     points = fuse_depths(photos.parts_in(lattice, wide, relief), lattice, wide, relief)
     return points.select(finest_of_cubes(points.pieces.xyz, points.footprint, lattice, tile))
+
+
+def _count_classes(work: Path, count: int) -> dict[str, int]:
+    """Number of points of each class that occurs."""
+    counts = np.zeros(CLASSES, np.int64)
+    for number in range(count):
+        with open_archive(work / f"{number:06d}.npz") as kept:
+            counts += np.bincount(kept["classes"], minlength=CLASSES)
+    return {str(number): int(counts[number]) for number in np.flatnonzero(counts).tolist()}
 
 
 def _load_chunks(work: Path, count: int) -> Iterator[CloudChunk]:

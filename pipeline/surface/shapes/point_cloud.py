@@ -45,12 +45,19 @@ class CloudChunk:
         colours: Red, green, blue.
         normals: East, north, up, of unit length; zero where unknown.
         confidence: Number of photos that confirm each point.
+        classes: Classes of LAS; None if they are not classified, which is class 0.
     """
 
     positions: Float64[np.ndarray, "n 3"]
     colours: UInt8[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"]
     confidence: UInt8[np.ndarray, " n"]
+    classes: UInt8[np.ndarray, " n"] | None = None
+
+    def select(self, rows: slice) -> CloudChunk:
+        """The points of these rows."""
+        classes = None if self.classes is None else self.classes[rows]
+        return CloudChunk(self.positions[rows], self.colours[rows], self.normals[rows], self.confidence[rows], classes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +143,7 @@ def _pieces(chunks: Iterable[CloudChunk]) -> Iterator[CloudChunk]:
     """These points, at most ``ROWS`` at a time."""
     for chunk in chunks:
         for start in range(0, len(chunk.positions), ROWS):
-            rows = slice(start, start + ROWS)
-            yield CloudChunk(chunk.positions[rows], chunk.colours[rows], chunk.normals[rows], chunk.confidence[rows])
+            yield chunk.select(slice(start, start + ROWS))
 
 
 def _record(chunk: CloudChunk, frame: CloudFrame, header: laspy.LasHeader) -> laspy.ScaleAwarePointRecord:
@@ -151,6 +157,8 @@ def _record(chunk: CloudChunk, frame: CloudFrame, header: laspy.LasHeader) -> la
     for axis, name in enumerate(NORMAL_FIELDS):
         record.array[name] = np.rint(np.clip(normals[:, axis], -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
     record.array[CONFIDENCE_FIELD] = chunk.confidence
+    if chunk.classes is not None:
+        record["classification"] = chunk.classes
     record["return_number"] = np.ones(len(steps), np.uint8)
     record["number_of_returns"] = np.ones(len(steps), np.uint8)
     return record

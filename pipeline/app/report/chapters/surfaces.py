@@ -44,6 +44,10 @@ def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     if ortho.get("pixels"):
         facts.insert(0, ("pixel of the orthophoto", length(ortho["pixel_m"])))
         facts.append(("exposures balanced over", f"{ortho['exposures_stops']:.1f} stops"))
+    dtm = inputs.summary("dtm")
+    if dtm.get("cells"):
+        shares = f"{dtm['ground_share']:.0%} seen, {dtm['building_share']:.0%} under buildings"
+        facts.append(("ground in the terrain model", f"{shares}; contours of the {dtm['contours']}"))
     cloud, mesh = inputs.summary("cloud"), inputs.summary("mesh")
     if cloud.get("points"):
         facts.append(("points of the cloud", f"{count(cloud['points'])}, {length(cloud['spacing_m'])} apart"))
@@ -129,11 +133,13 @@ def _pictures(inputs: ReportInputs) -> list[dict[str, Any]]:
                 pixels,
             )
         )
-    path = _file(inputs, "dsm.files", "dsm.tif")
-    relief = None if path is None else relief_picture(path, PICTURE_SIDE)
-    if relief is not None:
-        text = f"dsm.tif: from {relief.low:.1f} (violet) to {relief.high:.1f} (yellow), lit from the north-west"
-        found.append(("surface model", text, relief.pixels))
+    models = ("surface model", "dsm.files", "dsm.tif"), ("terrain model", "dtm.files", "dtm.tif")
+    for name, part, file in models:
+        path = _file(inputs, part, file)
+        relief = None if path is None else relief_picture(path, PICTURE_SIDE)
+        if relief is not None:
+            text = f"{file}: from {relief.low:.1f} (violet) to {relief.high:.1f} (yellow), lit from the north-west"
+            found.append((name, text, relief.pixels))
     return [
         {"name": name, "text": text, "source": jpeg(pixels[..., ::-1].copy(), QUALITY)}
         | {"width": pixels.shape[1], "height": pixels.shape[0]}
