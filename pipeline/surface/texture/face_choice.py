@@ -106,7 +106,7 @@ class _Energy:
     cost: Float32[np.ndarray, "m k"]
     grey: Float32[np.ndarray, "m k"]
 
-    def of(self, rows: Rows, photo: Labels, label: Labels) -> Float32[np.ndarray, " r"]:
+    def of(self, rows: Rows, photo: Int16[np.ndarray, " r"], label: Labels) -> Float32[np.ndarray, " r"]:
         """The energy of showing a photo on each of some triangles; infinite where it is not in its list."""
         total = self._value(self.cost, rows, photo, np.inf)
         own = self._value(self.grey, rows, photo, np.nan)
@@ -122,7 +122,9 @@ class _Energy:
             total[seam] += np.float32(SEAM) + np.float32(SEAM_STEP) * unlike
         return total
 
-    def _value(self, values: Float32[np.ndarray, "m k"], rows: Rows, photo: Labels, missing: float) -> np.ndarray:
+    def _value(
+        self, values: Float32[np.ndarray, "m k"], rows: Rows, photo: Int16[np.ndarray, " r"], missing: float
+    ) -> np.ndarray:
         same = self.lists.photo[rows] == photo[:, None]
         found = np.take_along_axis(values[rows], same.argmax(axis=1)[:, None], axis=1)[:, 0]
         return np.where(same.any(axis=1) & (photo != NONE), found, np.float32(missing))
@@ -170,7 +172,7 @@ def _odd_costs(views: FaceViews, soft: Float32[np.ndarray, "m k"]) -> Float32[np
     return np.float32(ODD_COST) * np.clip(apart - np.float32(ODD_FREE), 0.0, np.float32(ODD_MOST))
 
 
-def _move_seams(energy: _Energy, label: Labels, groups: Sequence[Rows]) -> None:
+def _move_seams(energy: _Energy, label: Labels, groups: Sequence[Int64[np.ndarray, " _"]]) -> None:
     """Give triangles at seams the labels of neighbours where that is cheaper; changes the labels in place."""
     beyond = energy.lists.beyond
     for _ in range(SWEEPS):

@@ -68,3 +68,15 @@ def connected_parts(
     rank = np.empty(number, np.int32)
     rank[np.argsort(first, kind="stable")] = np.arange(number, dtype=np.int32)
     return number, rank[part]
+
+
+def reachable_from_borders(beyond: Int32[np.ndarray, "m 3"], open_to: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Which of the triangles that are open can be reached from the mesh's borders through others."""
+    found = open_to & (beyond < 0).any(axis=1)
+    edge = np.flatnonzero(found)
+    while edge.size:
+        near = np.unique(beyond[edge])
+        near = near[near >= 0]
+        edge = near[open_to[near] & ~found[near]]
+        found[edge] = True
+    return found

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int16, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float32, Float64, Int16, Int64, UInt8, UInt16
 
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.engine.stage import Reporter
@@ -197,7 +197,7 @@ class _Colours:
     places: Int64[np.ndarray, " k"]
     colour: UInt8[np.ndarray, "k 3"]
     contrast: Float32[np.ndarray, " k"]
-    clipped: np.ndarray
+    clipped: Bool[np.ndarray, " k"]
 
 
 def _with_colours(
@@ -235,7 +235,7 @@ def _colours_of(photos: PhotoSet, faces: FaceSamples, photo: np.ndarray, cell_m:
         samples.append(photos.levels.sample(number, (source, pixels), (east, north, up), every, cell_m))
     east, north, up = faces.points[0][:, rows]
     plain = sample_colours(source, pixels, (east, north, up), every, cell_m, PLAIN_TONE)
-    clipped = (plain >= WHITE).all(axis=1) | (plain <= BLACK).all(axis=1)
+    clipped = np.asarray((plain >= WHITE).all(axis=1) | (plain <= BLACK).all(axis=1))
     shown = np.stack(samples).astype(np.int32)
     grey = shown.sum(axis=2)  # three times the grey level
     contrast = (grey.max(axis=0) - grey.min(axis=0)).astype(np.float32) / np.float32(3.0)

@@ -122,8 +122,8 @@ def _scene(parts: list[PageMesh], lengths: list[int], starts: list[int]) -> dict
     views: list[dict[str, Any]] = [
         {"buffer": 0, "byteOffset": start, "byteLength": length} for start, length in zip(starts, lengths, strict=False)
     ]
-    for view, target in zip(views, targets, strict=False):
-        view["target"] = target
+    for buffer_view, target in zip(views, targets, strict=False):
+        buffer_view["target"] = target
     return {
         "asset": {"version": "2.0", "generator": "splatpipe"},
         "extensionsUsed": [UNLIT],

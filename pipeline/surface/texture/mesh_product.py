@@ -80,6 +80,7 @@ def make_mesh(task: TexturedMeshTask, work: Path, out: Path, report: Reporter) -
     folder.mkdir(parents=True, exist_ok=True)
     texturing = TextureTask(photos, task.cell_m, task.most_texels, shape.threads)
     made = texture_mesh(texturing, coloured, work, folder, report)
+    mesh = made.coloured.mesh
     write_mesh(folder, made, shape.surface.frame, shape.surface.boundary)
     save_textured_mesh(out / "textured.npz", made)
     return {

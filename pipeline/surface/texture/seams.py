@@ -75,4 +75,4 @@ def blend_seams(mesh: TriangleMesh, label: Labels, photo: Int16[np.ndarray, "m k
 def _counts_up(repeats: np.ndarray) -> np.ndarray:
     """0, 1, … for each of the repeats."""
     ends = np.cumsum(repeats)
-    return np.arange(int(ends[-1]) if len(ends) else 0) - np.repeat(ends - repeats, repeats)
+    return np.asarray(np.arange(int(ends[-1]) if len(ends) else 0) - np.repeat(ends - repeats, repeats))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
@@ -22,8 +20,8 @@ from splatpipe.pipeline.surface.depths.sources import LruCache
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh
 from splatpipe.pipeline.surface.texture.charts import make_charts
 from splatpipe.pipeline.surface.texture.face_choice import Labels, choose_photos
-from splatpipe.pipeline.surface.texture.face_graph import adjacent_faces
-from splatpipe.pipeline.surface.texture.face_views import rate_faces, sample_faces
+from splatpipe.pipeline.surface.texture.face_graph import adjacent_faces, reachable_from_borders
+from splatpipe.pipeline.surface.texture.face_views import NONE, rate_faces, sample_faces
 from splatpipe.pipeline.surface.texture.packing import pack_charts
 from splatpipe.pipeline.surface.texture.page_colours import TextureInput, colour_page
 from splatpipe.pipeline.surface.texture.seams import blend_seams
@@ -54,6 +52,8 @@ class TextureTask:
 def texture_mesh(task: TextureTask, coloured: ColouredMesh, work: Path, out: Path, report: Reporter) -> TexturedMesh:
     """Put photos on a mesh; a killed call resumes after the choice of photos and after each page.
 
+    Triangles at the mesh's borders that no photo sees are removed: there the surface was only extrapolated.
+
     Args:
         task: Inputs.
         coloured: The mesh, with the colours of what no photo sees.
@@ -65,12 +65,14 @@ def texture_mesh(task: TextureTask, coloured: ColouredMesh, work: Path, out: Pat
         ValueError: if depths or pixels do not fit their camera.
         OSError: if the disk is full or not writable.
     """
-    mesh = coloured.mesh
-    beyond = adjacent_faces(mesh.triangles)
+    beyond = adjacent_faces(coloured.mesh.triangles)
     with pixels_on_disk(task.photos.sources, work, PIXEL_BYTES) as sources:
         photos = replace(task.photos, sources=sources)
         label, listed = _choose(task, photos, coloured, beyond, work / "choice.npz", report)
-        charts = make_charts(mesh, label, beyond, sources, task.most_texels)
+        kept = ~reachable_from_borders(beyond, label == NONE)
+        coloured, label, listed = coloured.select(kept), label[kept], listed[kept]
+        mesh = coloured.mesh
+        charts = make_charts(mesh, label, adjacent_faces(mesh.triangles), sources, task.most_texels)
         atlas, blends = pack_charts(charts), blend_seams(mesh, label, listed)
         pages = page_paths(out, len(atlas.sizes))
         inputs = TextureInput(coloured, charts, atlas, blends, sources, photos.levels, LruCache(PIXEL_BYTES))
@@ -99,11 +101,3 @@ def _write_page(path: Path, page: np.ndarray) -> None:
         Image.fromarray(page).save(file, "JPEG", quality=QUALITY, subsampling="4:2:0")
 
     write_durably(path, write)
-
-
-def remove_pages(folder: Path, keep: Sequence[Path] = ()) -> None:
-    """Remove the pages of a folder, e.g. of an earlier attempt."""
-    for path in folder.glob("mesh_*.jpg"):
-        if path not in keep:
-            with suppress(FileNotFoundError):
-                path.unlink()

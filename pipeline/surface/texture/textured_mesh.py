@@ -5,6 +5,7 @@ The part `mesh.textured` has the arrays, and names the pages, which lie among th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,41 +103,43 @@ def load_textured_mesh(path: Path, files: Path) -> TexturedMesh | None:
         kept = read_archive(path)
         if not kept:
             return None
+        _check(kept)
         mesh = TriangleMesh(kept["vertices"].astype(np.float64), kept["triangles"].astype(np.int64))
         atlas = Atlas(*(kept[name] for name in ("corners", "chart", "rects", "sizes")))
-        found = TexturedMesh(ColouredMesh(mesh, kept["colours"]), atlas, page_paths(files / FOLDER, len(atlas.sizes)))
-        _check(found)
+        pages = page_paths(files / FOLDER, len(atlas.sizes))
+        missing = [page.name for page in pages if not page.is_file()]
+        if missing:
+            raise ValueError(f"{missing[0]} is missing")
     except (OSError, ValueError, KeyError, IndexError) as error:
         raise StageError(
             f"The textured mesh {path.name} cannot be read: {error}", "Run again with --rerun mesh."
         ) from error
-    return found
+    return TexturedMesh(ColouredMesh(mesh, kept["colours"]), atlas, pages)
 
 
-def _check(made: TexturedMesh) -> None:
-    mesh, atlas, colours = made.coloured.mesh, made.atlas, made.coloured.colours
+def _check(arrays: Mapping[str, np.ndarray]) -> None:
+    """Check the shapes and types of stored arrays, and that they point into each other."""
+    vertices, triangles, charts, pages = (len(arrays[name]) for name in ("vertices", "triangles", "rects", "sizes"))
     shapes = {
-        "vertices": (mesh.vertices, (len(mesh.vertices), 3), "f"),
-        "colours": (colours, (len(mesh.vertices), 3), "u"),
-        "triangles": (mesh.triangles, (len(mesh.triangles), 3), "i"),
-        "corners": (atlas.corners, (len(mesh.triangles), 3, 2), "f"),
-        "chart": (atlas.chart, (len(mesh.triangles),), "i"),
-        "rects": (atlas.rects, (len(atlas.rects), 5), "i"),
-        "sizes": (atlas.sizes, (len(atlas.sizes), 2), "i"),
+        "vertices": ((vertices, 3), np.float64),
+        "colours": ((vertices, 3), np.uint8),
+        "triangles": ((triangles, 3), np.int32),
+        "corners": ((triangles, 3, 2), np.float32),
+        "chart": ((triangles,), np.int32),
+        "rects": ((charts, 5), np.int32),
+        "sizes": ((pages, 2), np.int32),
     }
-    for name, (array, shape, kind) in shapes.items():
-        if array.shape != shape or array.dtype.kind != kind:
-            raise ValueError(f"{name} of {array.dtype} {array.shape}")
-    if not (np.isfinite(mesh.vertices).all() and np.isfinite(atlas.corners).all()):
+    for name, (shape, kind) in shapes.items():
+        if arrays[name].shape != shape or arrays[name].dtype != kind:
+            raise ValueError(f"{name} of {arrays[name].dtype} {arrays[name].shape}")
+    if not (np.isfinite(arrays["vertices"]).all() and np.isfinite(arrays["corners"]).all()):
         raise ValueError("coordinates that are no numbers")
-    if len(atlas.sizes) > MOST_PAGES or (atlas.sizes < 1).any() or (atlas.sizes > PAGE_SIDE).any():
+    sizes = arrays["sizes"]
+    if pages > MOST_PAGES or (sizes < 1).any() or (sizes > PAGE_SIDE).any():
         raise ValueError("pages of impossible sizes")
-    _check_range("triangles", mesh.triangles, len(mesh.vertices))
-    _check_range("chart", atlas.chart, len(atlas.rects))
-    _check_range("rects", atlas.rects[:, 0], len(atlas.sizes))
-    missing = [page.name for page in made.pages if not page.is_file()]
-    if missing:
-        raise ValueError(f"{missing[0]} is missing")
+    _check_range("triangles", arrays["triangles"], vertices)
+    _check_range("chart", arrays["chart"], charts)
+    _check_range("rects", arrays["rects"][:, 0], pages)
 
 
 def _check_range(name: str, indices: np.ndarray, count: int) -> None:
