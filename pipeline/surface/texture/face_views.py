@@ -69,7 +69,7 @@ class FaceSamples:
     """
 
     order: Int64[np.ndarray, " m"]
-    starts: Int64[np.ndarray, " d"]
+    starts: Int64[np.ndarray, " _"]
     turns: Float64[np.ndarray, "d 3 3"]
     points: Float64[np.ndarray, "4 3 m"]
     normal: Float64[np.ndarray, "3 m"]

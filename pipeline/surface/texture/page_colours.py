@@ -13,7 +13,7 @@ from jaxtyping import Int64, UInt8
 from splatpipe.pipeline.engine.parallel import ordered_map
 from splatpipe.pipeline.surface.depths.photo_gains import PhotoGains
 from splatpipe.pipeline.surface.depths.photo_samples import PhotoSource, pixel_loader
-from splatpipe.pipeline.surface.depths.photo_set import unproject_pixels
+from splatpipe.pipeline.surface.depths.photo_set import rotate
 from splatpipe.pipeline.surface.depths.point_visibility import Points
 from splatpipe.pipeline.surface.depths.sources import LruCache
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh
@@ -114,8 +114,9 @@ def _draw_charts(task: TextureInput, charts: list[int]) -> UInt8[np.ndarray, "n 
         row = top + (np.arange(height) + (0.5 - BORDER)) / scale
         columns.append(np.tile(column, height))
         rows.append(np.repeat(row, width))
-    column, row = np.concatenate(columns) - 0.5, np.concatenate(rows) - 0.5
-    east, north, up = unproject_pixels(camera, row, column, np.ones(len(row)))
+    x, y = (np.concatenate(columns) - camera.cx) / camera.fx, (np.concatenate(rows) - camera.cy) / camera.fy
+    centre, ray = camera.centre(), rotate(camera.cam_from_world[:3, :3].T, x, y)
+    east, north, up = (centre[axis] + ray[axis] for axis in range(3))
     return task.sample(number, (east, north, up), 1.0 / (scale * max(camera.fx, camera.fy)))
 
 
