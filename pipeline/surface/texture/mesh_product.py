@@ -11,7 +11,7 @@ import numpy as np
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.splat.containers.archives import open_archive
-from splatpipe.pipeline.surface.shapes.decimation import decimate, split_long_edges
+from splatpipe.pipeline.surface.shapes.decimation import decimate, simplifier, split_long_edges
 from splatpipe.pipeline.surface.shapes.point_colours import photo_set
 from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, fine_mesh, vertex_colours
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, in_order
@@ -53,11 +53,12 @@ def make_mesh(task: TexturedMeshTask, work: Path, out: Path, report: Reporter) -
         Statistics: triangles, vertices, area, voxel size, texture pages and their pixels.
 
     Raises:
-        MachineError: if open3d is not installed, or the disk is full.
+        MachineError: if open3d or fast-simplification is not installed, or the disk is full.
         SplatpipeError: if there is no surface that enough photos see.
         ValueError: if depths or pixels do not fit their camera.
     """
     open3d()
+    simplifier()
     shape = task.shape
     photos = photo_set(shape.surface.photos, shape.voxel_m, shape.threads)
     work.mkdir(exist_ok=True)
