@@ -136,9 +136,11 @@ def check_possible(out: Path, *tables: dict[str, Any]) -> None:
         )
 
     if "mesh" in changed and run.config(LineConfig, *tables)[1].mesh.enabled:
+        from splatpipe.pipeline.surface.shapes.decimation import simplifier
         from splatpipe.pipeline.surface.shapes.tsdf import open3d
 
         open3d()
+        simplifier()
 
 
 def measurement_lines(out: Path, measured: Mapping[str, Any]) -> list[str]:

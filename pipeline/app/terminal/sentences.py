@@ -199,7 +199,9 @@ def _cloud(facts: Figures) -> str:
 
 
 def _mesh(facts: Figures) -> str:
-    return f"{count(facts['triangles'])} triangles" if facts["triangles"] else "no mesh"
+    if not facts["triangles"]:
+        return "no mesh"
+    return f"{count(facts['triangles'])} triangles, textures of {facts['texture_pixels'] / 1e6:.0f} megapixels"
 
 
 SENTENCES: Mapping[str, Callable[[Figures], str]] = {

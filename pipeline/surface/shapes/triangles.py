@@ -58,6 +58,11 @@ class ColouredMesh:
     mesh: TriangleMesh
     colours: UInt8[np.ndarray, "n 3"]
 
+    def select(self, kept: Bool[np.ndarray, " m"]) -> ColouredMesh:
+        """The chosen triangles, with only the vertices that they use."""
+        rows = np.unique(self.mesh.triangles[kept])
+        return ColouredMesh(self.mesh.select(kept), self.colours[rows])
+
 
 def in_order(mesh: TriangleMesh) -> TriangleMesh:
     """Sort vertices by position and triangles by vertex, and drop degenerate triangles."""

@@ -5,23 +5,29 @@ from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plyfile
 import pytest
 import trimesh
 from house_photos import GSD_M, Recorder, house_site, photos, run_surface, surface_distances
-from house_site import true_height
+from house_site import true_height, true_orthophoto
+from PIL import Image
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface.depths.photo_set import PhotoSet
 from splatpipe.pipeline.surface.shapes.blocks import SIDE, blocks_of, keys_of, surface_blocks
-from splatpipe.pipeline.surface.shapes.mesh_files import write_mesh
+from splatpipe.pipeline.surface.shapes.decimation import decimate
 from splatpipe.pipeline.surface.shapes.point_colours import photo_set
-from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, decimate, make_mesh, vertex_colours
+from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, vertex_colours
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, in_order, remove_small_components
+from splatpipe.pipeline.surface.texture.mesh_files import write_mesh
+from splatpipe.pipeline.surface.texture.mesh_product import TexturedMeshTask, make_mesh
+from splatpipe.pipeline.surface.texture.texture import TextureTask, texture_mesh
+from splatpipe.pipeline.surface.texture.textured_mesh import Atlas, TexturedMesh, load_textured_mesh, page_paths
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 
 FRAME = Frame("enu", Similarity.identity(), Origin(47.8412, 13.5127, 512.0), "ellipsoidal", crs="EPSG:32633")
@@ -41,6 +47,33 @@ def flat_mesh(east: float, cells: int, step: float = 0.25, height: float = 0.0) 
     one = np.stack([corner, corner + 1, corner + cells + 2], axis=1)
     other = np.stack([corner, corner + cells + 2, corner + cells + 1], axis=1)
     return TriangleMesh(vertices, np.concatenate([one, other]))
+
+
+def with_page(folder: Path, coloured: ColouredMesh) -> TexturedMesh:
+    """A square mesh with a page that is red, and blue in the north-east."""
+    places = coloured.mesh.vertices - coloured.mesh.vertices.min(axis=0)
+    at = places[:, :2] / places[:, :2].max() * 60.0 + 2.0
+    at[:, 1] = 64.0 - at[:, 1]  # rows go down
+    page = np.zeros((64, 64, 3), np.uint8)
+    page[..., 0] = 255
+    page[:32, 32:] = (0, 0, 255)
+    pages = page_paths(folder, 1)
+    Image.fromarray(page).save(pages[0], quality=95, subsampling=0)
+    rects, count = np.array([[0, 0, 0, 64, 64]], np.int32), len(coloured.mesh.triangles)
+    corners = at[coloured.mesh.triangles].astype(np.float32)
+    atlas = Atlas(corners, np.zeros(count, np.int32), rects, np.array([[64, 64]], np.int32))
+    return TexturedMesh(coloured, atlas, pages)
+
+
+def assert_blue_in_the_north_east(visual: Any, mesh: TriangleMesh, faces: np.ndarray) -> None:
+    """The colours at the middles of triangles, by another program's reading of texture coordinates and image."""
+    material = visual.material
+    image = getattr(material, "baseColorTexture", None) or material.image
+    colours = visual.uv[faces].mean(axis=1)
+    shown = trimesh.visual.color.uv_to_color(colours, image)[:, :3]
+    middle = mesh.vertices[mesh.triangles].mean(axis=1)[:, :2]
+    blue = (middle > (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))[:2] / 2.0).all(axis=1)
+    assert (shown[blue] @ [-1, 0, 1] > 200).all() and (shown[~blue] @ [1, 0, -1] > 200).all() and blue.sum() == 2
 
 
 def together(*meshes: TriangleMesh) -> TriangleMesh:
@@ -123,13 +156,21 @@ def test_files_are_read_by_other_programs_in_the_right_place(tmp_path: Path) -> 
     facts = PlanArea.seen_from_above([(ring,)]).facts()
     degrees = [[[[13.5, 47.8], [13.6, 47.8], [13.6, 47.9], [13.5, 47.9]]]]
     (tmp_path / "boundary.json").write_text(json.dumps({"world": facts, "degrees": degrees}))
-    write_mesh(tmp_path, ColouredMesh(mesh, colours), uncertain, tmp_path / "boundary.json")
+    made = with_page(tmp_path, ColouredMesh(mesh, colours))
+    write_mesh(tmp_path, made, uncertain, tmp_path / "boundary.json")
     (tmp_path / "boundary.json").unlink()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["georef.json", "mesh.glb", "mesh.ply"]
+    names = ["georef.json", "mesh.glb", "mesh.mtl", "mesh.obj", "mesh.ply", "mesh_00.jpg"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
     glb = trimesh.load(tmp_path / "mesh.glb", force="mesh", process=False)
     np.testing.assert_allclose(glb.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0], mesh.vertices)  # y up
     np.testing.assert_array_equal(glb.faces, mesh.triangles)
     np.testing.assert_allclose(glb.face_normals, np.tile([0.0, 1.0, 0.0], (8, 1)))
+    assert_blue_in_the_north_east(glb.visual, mesh, glb.faces)
+    obj = trimesh.load(tmp_path / "mesh.obj", force="mesh", process=False)
+    np.testing.assert_allclose(obj.vertices[obj.faces], mesh.vertices[mesh.triangles])  # z up
+    assert_blue_in_the_north_east(obj.visual, TriangleMesh(obj.vertices, obj.faces), obj.faces)
+    head = (tmp_path / "mesh.obj").read_text().split("mtllib")[0]
+    assert "# offset: 388" in head and "crs: EPSG:32633" in head
     ply = plyfile.PlyData.read(tmp_path / "mesh.ply")
     np.testing.assert_array_equal(np.stack([ply["vertex"][a] for a in "xyz"], axis=1), mesh.vertices)
     np.testing.assert_array_equal(np.stack([ply["vertex"][c] for c in ("red", "green", "blue")], axis=1), colours)
@@ -142,17 +183,43 @@ def test_files_are_read_by_other_programs_in_the_right_place(tmp_path: Path) -> 
     assert placed["boundary"]["wgs84"]["coordinates"] == [[[*degrees[0][0], degrees[0][0][0]]]]
 
 
-def test_glb_has_16_bit_linear_colours_and_is_unlit(tmp_path: Path) -> None:
-    colours = np.tile(np.array([[0, 30, 255]], np.uint8), (9, 1))
-    write_mesh(tmp_path, ColouredMesh(flat_mesh(0.0, 2), colours), FRAME, None)
+def test_glb_has_a_jpeg_per_page_and_is_unlit(tmp_path: Path) -> None:
+    made = with_page(tmp_path, ColouredMesh(flat_mesh(0.0, 2), np.zeros((9, 3), np.uint8)))
+    write_mesh(tmp_path, made, FRAME, None)
     data = (tmp_path / "mesh.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     scene, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
     assert int.from_bytes(data[8:12], "little") == len(data) and scene["buffers"][0]["byteLength"] == len(binary)
-    view = scene["bufferViews"][scene["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
-    light = np.frombuffer(binary, "<u2", 4, view["byteOffset"])
-    assert light.tolist() == [0, round(((30 / 255 + 0.055) / 1.055) ** 2.4 * 65535), 65535, 65535]
+    view = scene["bufferViews"][scene["images"][0]["bufferView"]]
+    image = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    assert image == made.pages[0].read_bytes() and scene["images"][0]["mimeType"] == "image/jpeg"
+    assert all(view["byteOffset"] % 4 == 0 for view in scene["bufferViews"])
     assert "KHR_materials_unlit" in scene["materials"][0]["extensions"]
+
+
+def test_textures_show_the_photos_where_they_see_the_mesh_and_nothing_else(tmp_path: Path) -> None:
+    """Lawn, path and roof from above; a part below the ground, which no photo sees, is removed."""
+    lawn, below = flat_mesh(-4.9, 4, 0.2), flat_mesh(-4.9, 2, 0.2, height=-2.0)
+    mesh = together(TriangleMesh(lawn.vertices - [0.0, 4.9, 0.0], lawn.triangles), below)
+    coloured = ColouredMesh(mesh, vertex_colours(exact_photos(), mesh, 1))
+    task = TextureTask(exact_photos(), GSD_M, 1e6, 1)
+    made = texture_mesh(task, coloured, tmp_path, tmp_path, Recorder())
+    shape, atlas = made.coloured.mesh, made.atlas
+    assert len(shape.triangles) == 32 and shape.vertices[:, 2].min() == 0.0
+    page = np.asarray(Image.open(made.pages[0]), np.float64)
+    middle = atlas.corners.mean(axis=1)
+    shown = page[middle[:, 1].astype(int), middle[:, 0].astype(int)]
+    east, north, _ = shape.vertices[shape.triangles].mean(axis=1).T
+    assert np.abs(shown - true_orthophoto(east, north)).mean() < 12.0
+    size = np.linalg.norm(atlas.corners[:, 1] - atlas.corners[:, 0], axis=1)  # 0.2 m, or its diagonal
+    assert (size > 0.2 / GSD_M * 0.5).all()  # at the photos' resolution
+    before = made.pages[0].read_bytes()
+    made.pages[0].unlink()
+    again = texture_mesh(replace(task, threads=3), coloured, tmp_path, tmp_path, Recorder())  # the choice is kept
+    assert again.pages[0].read_bytes() == before
+    (tmp_path / "choice.npz").unlink()
+    small = texture_mesh(replace(task, most_texels=120.0), coloured, tmp_path, tmp_path, Recorder())
+    assert small.atlas.rects[:, 3:].prod(axis=1).sum() <= 120 < atlas.rects[:, 3:].prod(axis=1).sum()
 
 
 def test_few_triangles_are_unchanged() -> None:
@@ -162,7 +229,8 @@ def test_few_triangles_are_unchanged() -> None:
 
 def test_the_complete_mesh_or_how_to_install_open3d(tmp_path: Path) -> None:
     """open3d is an extra: if it is missing, the error says how to install it; no other test here needs it."""
-    task = MeshTask(run_surface(FRAME, photos(noise_px=0.1, wild=0.03)), house_site(), 2.0 * GSD_M, 4000, 1)
+    shape = MeshTask(run_surface(FRAME, photos(noise_px=0.1, wild=0.03)), house_site(), 2.0 * GSD_M, 4000, 1)
+    task, files = TexturedMeshTask(shape, GSD_M, 2e6), tmp_path / "files" / "mesh"
     if find_spec("open3d") is None:
         with pytest.raises(MachineError) as refused:
             make_mesh(task, tmp_path / "work", tmp_path, Recorder())
@@ -170,8 +238,8 @@ def test_the_complete_mesh_or_how_to_install_open3d(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())
         return
     summary = make_mesh(task, tmp_path / "work", tmp_path, Recorder())
-    mesh = trimesh.load(tmp_path / "mesh.ply", process=False)
-    assert 3000 < summary["triangles"] == len(mesh.faces) <= 4000
+    mesh = trimesh.load(files / "mesh.ply", process=False)
+    assert 2500 < summary["triangles"] == len(mesh.faces) <= 4000
     places, _ = trimesh.sample.sample_surface(mesh, 20_000, seed=1)
     off = surface_distances(np.asarray(places))
     assert np.quantile(off, 0.5) < 0.3 * GSD_M
@@ -179,13 +247,16 @@ def test_the_complete_mesh_or_how_to_install_open3d(tmp_path: Path) -> None:
     eaves = ((np.abs(places[:, :2]) >= [3.8, 2.8]).any(axis=1)) & (places[:, 2] > 2.0)
     assert (off < 2.0 * GSD_M)[~eaves].mean() > 0.999 and (off < 4.0 * GSD_M).mean() > 0.99
     assert summary["area_m2"] > 0.95 * (100.0 + 2.0 * 9.0 * 4.03 + 28.0 * 3.0 - 56.0)
-    made = (tmp_path / "mesh.glb").read_bytes()
-    make_mesh(replace(task, threads=2), tmp_path / "other", tmp_path, Recorder())
-    assert (tmp_path / "mesh.glb").read_bytes() == made
-    (tmp_path / "mesh.glb").unlink()
+    made = (files / "mesh.glb").read_bytes()
+    made_textured = load_textured_mesh(tmp_path / "textured.npz", tmp_path / "files")
+    assert made_textured is not None and len(made_textured.coloured.mesh.triangles) == summary["triangles"]
+    other = tmp_path / "other"
+    make_mesh(replace(task, shape=replace(shape, threads=2)), other / "work", other, Recorder())
+    assert (other / "files" / "mesh" / "mesh.glb").read_bytes() == made
+    (files / "mesh.glb").unlink()
     again = Recorder()
     make_mesh(task, tmp_path / "work", tmp_path, again)  # as after a kill while it was decimated
-    assert (tmp_path / "mesh.glb").read_bytes() == made and again.steps == [(0, 1), (1, 1)]
-    empty = replace(task, site=replace(house_site(), reach=(500.0, 500.0, 510.0, 510.0)))
+    assert (files / "mesh.glb").read_bytes() == made and again.steps == [(1, 1)]
+    empty = replace(task, shape=replace(shape, site=replace(house_site(), reach=(500.0, 500.0, 510.0, 510.0))))
     with pytest.raises(SplatpipeError, match="no surface"):
         make_mesh(empty, tmp_path / "empty", tmp_path, Recorder())

@@ -53,6 +53,9 @@ def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
         facts.append(("points of the cloud", f"{count(cloud['points'])}, {length(cloud['spacing_m'])} apart"))
     if mesh.get("triangles"):
         facts.append(("triangles of the mesh", f"{count(mesh['triangles'])}, of voxels of {length(mesh['voxel_m'])}"))
+    if mesh.get("pages"):
+        pages = f"{count(mesh['pages'])} image{'s' if mesh['pages'] > 1 else ''}"
+        facts.append(("textures of the mesh", f"{pages}, {mesh['texture_pixels'] / 1e6:.0f} megapixels"))
     facades = _facades(inputs, drawn=drawn)
     chapter = {"facts": facts, "pictures": _pictures(inputs) if drawn else [], "facades": facades}
     return {**chapter, "measured": _measurement_tables(inputs, drawn=drawn)}
