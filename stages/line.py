@@ -323,10 +323,10 @@ CLOUD = Stage(
 )
 MESH = Stage(
     "mesh",
-    version=2,
+    version=3,
     config=MeshConfig,
     reads=("dsm.site", *SURFACE_READS),
-    parts={"files": "files"},
+    parts={"files": "files", "textured": "textured.npz"},
     entry="splatpipe.stages.mesh:run",
     resumable=True,
     deliverables=("files",),
