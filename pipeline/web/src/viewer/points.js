@@ -1,4 +1,4 @@
-// The sparse points of structure from motion.
+// Point clouds: the sparse points of structure from motion, and the dense cloud.
 
 import { BufferAttribute, BufferGeometry, Points, ShaderMaterial, Vector3 } from "three";
 
@@ -39,9 +39,9 @@ export function nearestPoint(points, view, x, y) {
   const xyz = points.geometry.getAttribute("position")?.array ?? [];
   const { fx, fy, cx, cy } = view.intrinsics();
   const { right, up, forward } = view.axes();
-  const eye = view.position;
+  const eye = view.position.clone().sub(points.position);
   let [best, least] = [-1, Infinity];
-  for (let i = 0; i < xyz.length; i += 3) { // view.project inlined, without its vectors for each of 150,000 points
+  for (let i = 0; i < xyz.length; i += 3) { // view.project inlined, without its vectors for each of 250,000 points
     const [x0, y0, z0] = [xyz[i] - eye.x, xyz[i + 1] - eye.y, xyz[i + 2] - eye.z];
     const depth = x0 * forward.x + y0 * forward.y + z0 * forward.z;
     const across = cx + (fx * (x0 * right.x + y0 * right.y + z0 * right.z)) / depth;
@@ -51,5 +51,5 @@ export function nearestPoint(points, view, x, y) {
     const cost = depth * (1 + off / REACH_PX);
     if (cost < least) [best, least] = [i, cost];
   }
-  return best < 0 ? null : new Vector3().fromArray(xyz, best);
+  return best < 0 ? null : new Vector3().fromArray(xyz, best).add(points.position);
 }
