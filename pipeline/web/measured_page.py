@@ -34,7 +34,6 @@ def with_measurements(page: bytes, measurements: Mapping[str, Any] | None) -> by
     content = NOTHING
     if measurements is not None:
         content = script_safe(json.dumps(measurements, ensure_ascii=False, allow_nan=False, sort_keys=True)).encode()
-        content += b" " * (zlib.crc32(content) % SIZES)
     return _with(page, BEGIN, content)
 
 
@@ -52,6 +51,8 @@ def with_surfaces(page: bytes, surfaces: bytes | None) -> bytes:
 
 
 def _with(page: bytes, begin: bytes, content: bytes) -> bytes:
+    if content != NOTHING:
+        content += b" " * (zlib.crc32(content) % SIZES)
     before, mark, after = page.partition(begin)
     _, end, rest = after.partition(END)
     if not mark or not end:

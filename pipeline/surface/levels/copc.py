@@ -24,6 +24,7 @@ from laspy.vlrs.vlr import VLR
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.engine.files.output_file import new_file
+from splatpipe.pipeline.surface.levels.cloud_file import cloud_pieces, open_cloud
 from splatpipe.pipeline.surface.levels.point_octree import (
     CELLS,
     Cube,
@@ -37,7 +38,6 @@ from splatpipe.pipeline.surface.levels.point_octree import (
 )
 
 POINT_FORMATS = (6, 7, 8)  # those of LAS 1.4 that COPC allows
-ROWS = 1 << 18  # points read at a time
 _INFO = struct.Struct("<5d2Q2d88x")  # centre, half side, spacing, the root page's place and size, GPS times
 _EXTENDED = struct.Struct("<H16sHQ32s")  # header of a record at the end of the file
 _ENTRY = struct.Struct("<iiiiQii")  # level, x, y, z; its chunk's place, bytes and points
@@ -78,32 +78,28 @@ def write_copc(source: Path, path: Path, work: Path, progress: Callable[[int, in
     shutil.rmtree(work, ignore_errors=True)  # of a killed run
     work.mkdir(parents=True)
     try:
-        with laspy.open(source, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        with open_cloud(source) as reader:
             header = reader.header
         if header.point_format.id not in POINT_FORMATS:
             raise SplatpipeError(f"{source.name} has points of format {header.point_format.id}, not of LAS 1.4.")
-        lowest, highest = lowest_and_highest(_chunks(source))
+        lowest, highest = lowest_and_highest(_records(source))
         cube = Cube.around(*((lowest, highest) if header.point_count else (np.zeros(3, np.int64),) * 2))
         counts = PointCounts(cube)
-        for records in _chunks(source):
+        for records in _records(source):
             counts.add(records)
         piles = Piles(cube, counts, work)
-        for records in _chunks(source):
+        for records in _records(source):
             piles.add(records)
-        kind = header.point_format.dtype()
-        octree = PointOctree(cube, counts, piles, kind)
+        octree = PointOctree(cube, counts, piles, header.point_format.dtype())
         with whole_file(path) as aside, new_file(aside) as file:
             return _write(file, header, cube, octree.nodes(), progress)
-    except laspy.errors.LaspyException as error:
-        raise SplatpipeError(f"{source} cannot be read: {error}", "Make it again with --rerun cloud.") from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _chunks(source: Path) -> Iterator[Records]:
-    with laspy.open(source, laz_backend=laspy.LazBackend.Lazrs) as reader:
-        for points in reader.chunk_iterator(ROWS):
-            yield points.array
+def _records(source: Path) -> Iterator[Records]:
+    for points in cloud_pieces(source):
+        yield points.array
 
 
 def _write(
@@ -166,14 +162,12 @@ def _chunk_sizes(path: Path, start: int, laszip: lazrs.LazVlr) -> list[tuple[int
 
 
 def _hierarchy(written: list[tuple[NodeKey, int]], chunks: list[tuple[int, int]], start: int) -> bytes:
-    """The nodes' entries in one page: 32 bytes each, 20 kB for a hundred million points."""
-    if [points for _, points in written] != [points for points, _ in chunks]:
-        raise AssertionError("lazrs wrote other chunks than it was given")
+    """The nodes' entries in one page: 32 bytes each, 100 kB for a hundred million points."""
+    chunks = [chunk for chunk in chunks if chunk[0]]  # the only one of a cloud without points has none
+    assert [points for _, points in written] == [points for points, _ in chunks], "lazrs wrote other chunks"
     entries, at = {}, start + 8  # after the offset of the chunk table
     for (key, points), (_, size) in zip(written, chunks, strict=True):
         entries[key] = (at, size, points)
         at += size
-    above = keys_above(list(entries))
-    return b"".join(
-        _ENTRY.pack(key.level, key.x, key.y, key.z, *entries.get(key, (0, 0, 0))) for key in above
-    )
+    keys = keys_above(list(entries))
+    return b"".join(_ENTRY.pack(key.level, key.x, key.y, key.z, *entries.get(key, (0, 0, 0))) for key in keys)

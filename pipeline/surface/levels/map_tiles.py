@@ -126,18 +126,19 @@ def _place_of(raster: rasterio.DatasetReader, frame: Frame) -> MapPlace:
     """
     if frame.origin is None:
         raise SplatpipeError("Maps need a georeferenced run.", "Give it control points or photos with positions.")
-    crs, inverse = open_map(frame), ~raster.transform
+    crs, at = open_map(frame), raster.transform  # north up, as all rasters of a run
     edge = np.linspace(0.0, 1.0, EDGE_STEPS)
     border = np.stack(np.meshgrid(edge * raster.width, edge * raster.height), axis=-1).reshape(-1, 2)
-    x, y = raster.transform * border.T
-    height = np.full(len(border), frame.origin.height_m / crs.height_unit_m)
-    geodetic = geodetic_from_crs(crs, np.stack([x, y, height], axis=1))
+    corner, cell = np.array([at.c, at.f]), np.array([at.a, at.e])
+    height = np.full((len(border), 1), frame.origin.height_m / crs.height_unit_m)
+    geodetic = geodetic_from_crs(crs, np.concatenate([corner + border * cell, height], axis=1))
     (south, west, _), (north, east, _) = geodetic.min(axis=0), geodetic.max(axis=0)
 
     def cells_from_crs(coordinates: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
-        return np.stack(inverse * coordinates.T, axis=1)
+        return np.asarray((coordinates - corner) / cell)
 
-    return MapPlace(crs, cells_from_crs, (float(west), float(south), float(east), float(north)), float(south + north) / 2.0)
+    box = (float(west), float(south), float(east), float(north))
+    return MapPlace(crs, cells_from_crs, box, (box[1] + box[3]) / 2.0)
 
 
 def _task(
@@ -173,7 +174,7 @@ def _write(task: _Task, path: Path, name: str, description: str) -> dict[str, in
         file.write(tile, picture)
         return picture
 
-    with tile_file(path, map_facts(name, description, task.place.box, task.zooms)) as file:
+    with tile_file(path, map_facts(name, description, task.place.whole_pixels(high), task.zooms)) as file:
         for tile in task.place.tiles(low):
             draw(tile, file)
         return {"tiles": file.count, "min_zoom": low, "max_zoom": high}

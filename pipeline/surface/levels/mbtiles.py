@@ -6,7 +6,6 @@ map fills are JPEG, those that it fills partly are PNG, and empty ones are left 
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -102,12 +101,11 @@ def map_facts(
         "format": "jpg",
         "type": "overlay",
         "version": "1.3",
-        "bounds": ",".join(f"{value:.9f}" for value in box),
+        "bounds": ",".join(f"{value:.12f}" for value in box),
         "center": f"{middle[0]:.9f},{middle[1]:.9f},{max(zooms[0], zooms[1] - 3)}",
         "minzoom": str(zooms[0]),
         "maxzoom": str(zooms[1]),
         "generator": "splatpipe",
-        "json": json.dumps({"tilestats": {}}),
     }
 
 

@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import laspy
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.surface.levels.cloud_file import cloud_pieces, open_cloud
 from splatpipe.pipeline.surface.shapes.point_cloud import SIXTEEN_BITS
 
-ROWS = 1 << 18  # points read at a time
+MIN_EXTENT = 1e-3  # of a cloud, in its CRS's unit
 COARSER = 2.0**0.25  # by which cubes grow while there are too many points
 
 
@@ -40,23 +39,20 @@ def thinned_cloud(path: Path, most: int) -> ThinnedCloud:
     Raises:
         SplatpipeError: if it cannot be read.
     """
-    try:
-        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
-            low = reader.header.mins
-            extent = np.maximum(reader.header.maxs - low, 1e-3)
-            cube = math.sqrt(float(extent[0] * extent[1]) / most)
-            kept, colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-            for points in reader.chunk_iterator(ROWS):
-                bands = np.stack([points.red, points.green, points.blue], axis=1) // SIXTEEN_BITS
-                kept = np.concatenate([kept, np.stack([points.x, points.y, points.z], axis=1)])
-                colours = np.concatenate([colours, bands.astype(np.uint8)])
-                rows = _one_a_cube(kept - low, cube)
-                while len(rows) > most:
-                    cube *= COARSER
-                    rows = rows[_one_a_cube(kept[rows] - low, cube)]
-                kept, colours = kept[rows], colours[rows]
-    except laspy.errors.LaspyException as error:
-        raise SplatpipeError(f"{path} cannot be read: {error}", "Make it again with --rerun cloud.") from error
+    with open_cloud(path) as reader:
+        low = reader.header.mins
+        extent = np.maximum(reader.header.maxs - low, MIN_EXTENT)
+    cube = math.sqrt(float(extent[0] * extent[1]) / most)
+    kept, colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    for points in cloud_pieces(path):
+        bands = np.stack([points.red, points.green, points.blue], axis=1) // SIXTEEN_BITS
+        kept = np.concatenate([kept, np.stack([points.x, points.y, points.z], axis=1)])
+        colours = np.concatenate([colours, bands.astype(np.uint8)])
+        rows = _one_a_cube(kept - low, cube)
+        while len(rows) > most:
+            cube *= COARSER
+            rows = rows[_one_a_cube(kept[rows] - low, cube)]
+        kept, colours = kept[rows], colours[rows]
     return ThinnedCloud(kept, colours)
 
 

@@ -122,6 +122,17 @@ class MapPlace:
             for column in range(left, right + 1):
                 yield MapTile(zoom, column, row)
 
+    def whole_pixels(self, zoom: int) -> tuple[float, float, float, float]:
+        """West, south, east, north of the pixels of a zoom that the raster touches, degrees.
+
+        GDAL and QGIS place a map by such a box, pixel by pixel from its corner, instead of by its tiles.
+        """
+        west, south, east, north = self.box
+        corners = pixels_from_geodetic(np.array([[north, west, 0.0], [south, east, 0.0]]), zoom)
+        outer = np.stack([np.floor(corners[0]), np.ceil(corners[1])])
+        (top, left, _), (bottom, right, _) = geodetic_from_pixels(outer, zoom, 0.0).tolist()
+        return left, bottom, right, top
+
     def touches(self, tile: MapTile) -> bool:
         """Whether a tile shows any of the raster."""
         west, south, east, north = self.box
