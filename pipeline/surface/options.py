@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatpipe.pipeline.engine.ranges import NonNegativeFloat, PositiveInt
+from splatpipe.pipeline.engine.ranges import NonNegativeFloat, PositiveFloat, PositiveInt
 from splatpipe.pipeline.engine.stage import StageConfig
 
 
@@ -39,6 +39,9 @@ class CloudConfig(StageConfig):
 
 class MeshConfig(StageConfig):
     enabled: bool = False
-    """Make the mesh: mesh/mesh.glb and mesh/mesh.ply. Requires open3d: pip install "splatpipe[mesh]"."""
+    """Make the mesh with the photos on it: mesh/mesh.glb, .obj and .ply. Requires open3d: pip install
+    "splatpipe[mesh]"."""
     triangles: PositiveInt = 1_000_000
     """Maximum number of triangles."""
+    texture_megapixels: PositiveFloat = 256.0
+    """Maximum size of all its textures; beyond it, they are coarser than the photos."""

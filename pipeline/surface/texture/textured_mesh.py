@@ -104,12 +104,12 @@ def load_textured_mesh(path: Path, files: Path) -> TexturedMesh | None:
             return None
         mesh = TriangleMesh(kept["vertices"].astype(np.float64), kept["triangles"].astype(np.int64))
         atlas = Atlas(*(kept[name] for name in ("corners", "chart", "rects", "sizes")))
-        found = TexturedMesh(
-            ColouredMesh(mesh, kept["colours"]), atlas, page_paths(files / FOLDER, len(atlas.sizes))
-        )
+        found = TexturedMesh(ColouredMesh(mesh, kept["colours"]), atlas, page_paths(files / FOLDER, len(atlas.sizes)))
         _check(found)
     except (OSError, ValueError, KeyError, IndexError) as error:
-        raise StageError(f"The textured mesh {path.name} cannot be read: {error}", "Run again with --rerun mesh.") from error
+        raise StageError(
+            f"The textured mesh {path.name} cannot be read: {error}", "Run again with --rerun mesh."
+        ) from error
     return found
 
 
