@@ -61,12 +61,14 @@ def simplified(mesh: ChartedMesh, locked: Bool[np.ndarray, " n"], most: int) -> 
             break
         before = len(small)
         edges, costs = _candidates(small, fixed, quadrics, refused)
-        chosen = _cheapest_around(small, edges, costs, (before - most) // 2 + 1)
-        good = chosen.select(_keeps_shape(small, chosen))
-        refused = np.concatenate([refused, _keys(chosen, len(used))])  # those that are carried out do not return
+        chosen = _cheapest_around(small, edges, costs)
+        keeps = _keeps_shape(small, chosen)
+        refused = np.concatenate([refused, _keys(chosen.select(~keeps), len(used))])
+        good = chosen.select(np.flatnonzero(keeps)[: (before - most) // 2 + 1])  # a collapse takes two triangles
         error = max(error, quadrics.merge(good))
         small = _collapsed(small, good)
-        if before - len(small) < MIN_GAIN * before and len(chosen.gone) < MIN_GAIN * before:
+        little = MIN_GAIN * before
+        if not len(chosen.gone) or max(before - len(small), len(chosen.gone)) < min(little, before - most):
             break
     return ChartedMesh(mesh.vertices, used[small.triangles], small.corners, small.charts), error
 
@@ -185,8 +187,8 @@ def _candidates(
     return both.select(best), costs[best]
 
 
-def _cheapest_around(mesh: ChartedMesh, edges: _Edges, costs: Float64[np.ndarray, " e"], most: int) -> _Edges:
-    """Edges whose vertices to go are no neighbours of each other, the cheapest first, at most a number of them."""
+def _cheapest_around(mesh: ChartedMesh, edges: _Edges, costs: Float64[np.ndarray, " e"]) -> _Edges:
+    """Edges whose vertices to go are no neighbours of each other, the cheapest first."""
     order = np.lexsort((edges.gone, costs))[: max(1, int(CHEAPEST * len(costs)))]
     rank = np.full(len(mesh.vertices), np.iinfo(np.int64).max)
     rank[edges.gone[order]] = np.arange(len(order))
@@ -195,8 +197,7 @@ def _cheapest_around(mesh: ChartedMesh, edges: _Edges, costs: Float64[np.ndarray
         p, q = mesh.triangles[:, a], mesh.triangles[:, b]
         np.minimum.at(least, p, rank[q])
         np.minimum.at(least, q, rank[p])
-    chosen = order[least[edges.gone[order]] == np.arange(len(order))]
-    return edges.select(chosen[:most])
+    return edges.select(order[least[edges.gone[order]] == np.arange(len(order))])
 
 
 def _keeps_shape(mesh: ChartedMesh, edges: _Edges) -> Bool[np.ndarray, " e"]:
