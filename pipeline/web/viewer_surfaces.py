@@ -39,8 +39,9 @@ def viewer_points(path: Path, frame: Frame) -> dict[str, Any] | None:
     cloud = thinned_cloud(path, MOST_POINTS)
     if not len(cloud.coordinates):
         return None
-    places = open_map(frame).local_from_crs(cloud.coordinates)
-    return {**_packed(places), "rgb": _base64(cloud.colours)}
+    crs = open_map(frame)
+    places = crs.local_from_crs(cloud.coordinates)
+    return {**_packed(places), "rgb": _base64(cloud.colours), "spacing": round(cloud.spacing * crs.unit_m, 6)}
 
 
 def viewer_mesh(made: TexturedMesh, work: Path) -> dict[str, Any] | None:

@@ -23,10 +23,12 @@ class ThinnedCloud:
     Attributes:
         coordinates: Easting, northing, height in the file's CRS.
         colours: Red, green, blue.
+        spacing: Side of the cubes that hold at most one of them, in the CRS's unit.
     """
 
     coordinates: Float64[np.ndarray, "n 3"]
     colours: UInt8[np.ndarray, "n 3"]
+    spacing: float
 
 
 def thinned_cloud(path: Path, most: int) -> ThinnedCloud:
@@ -53,7 +55,7 @@ def thinned_cloud(path: Path, most: int) -> ThinnedCloud:
             cube *= COARSER
             rows = rows[_one_a_cube(kept[rows] - low, cube)]
         kept, colours = kept[rows], colours[rows]
-    return ThinnedCloud(kept, colours)
+    return ThinnedCloud(kept, colours, cube)
 
 
 def _one_a_cube(places: Float64[np.ndarray, "n 3"], cube: float) -> np.ndarray:

@@ -3,28 +3,39 @@
 import { BufferAttribute, BufferGeometry, Points, ShaderMaterial, Vector3 } from "three";
 
 const SIZE_PX = 3.5;
+const NEAREST_PX = 1.5; // of dense points, however far
+const FILL = 1.6; // of the distance between points: diagonals, and slopes seen from above
 const REACH_PX = 10; // from a click
 
-/** Make an empty, hidden point cloud. */
-export function makePoints() {
+/**
+ * Make an empty, hidden point cloud.
+ * @param {number} spacing Distance between points, which they fill when near; 0 if it is not known.
+ */
+export function makePoints(spacing = 0) {
   const geometry = new BufferGeometry();
   const material = new ShaderMaterial({
-    uniforms: { size: { value: SIZE_PX } },
+    uniforms: { size: { value: SIZE_PX }, spacing: { value: spacing }, rows: { value: 1 } },
+    defines: { FILL },
     vertexShader: `
 attribute vec3 rgb;
 varying vec3 colour;
 uniform float size;
+uniform float spacing;
+uniform float rows;
 void main() {
   colour = rgb;
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
-  gl_PointSize = size;
+  gl_PointSize = max(size, 0.5 * FILL * spacing * projectionMatrix[1][1] * rows / gl_Position.w);
 }`,
     fragmentShader: "varying vec3 colour;\nvoid main() { gl_FragColor = vec4(colour, 1.0); }", // unchanged: sRGB
   });
   const points = new Points(geometry, material);
   points.frustumCulled = false;
   points.visible = false;
-  points.onBeforeRender = (renderer) => (material.uniforms.size.value = SIZE_PX * renderer.getPixelRatio());
+  points.onBeforeRender = (renderer) => {
+    material.uniforms.size.value = (spacing ? NEAREST_PX : SIZE_PX) * renderer.getPixelRatio();
+    material.uniforms.rows.value = renderer.domElement.height;
+  };
   return points;
 }
 

@@ -35,7 +35,7 @@ async function makeMesh(data) {
 }
 
 async function makeCloud(data) {
-  const cloud = makePoints();
+  const cloud = makePoints(data.spacing);
   fillPoints(cloud, { xyz: await places(data), rgb: await bytesOf(data.rgb) });
   return cloud;
 }
