@@ -1,7 +1,7 @@
 """Check that CesiumJS draws a mesh's 3D Tiles in the right place, without gaps where tiles of different levels meet.
 
-The site is made: hills and a block on 120 m, without holes, its pages a pattern with known marks. From low viewpoints near tiles
-are fine and far ones coarse; every pixel of the background that drawn ones enclose is a gap. With OUT, its
+The site is made: hills and a block on 120 m, without holes, its page a pattern. From low viewpoints near tiles are
+fine and far ones coarse; every pixel of the background that drawn ones enclose is a gap. With OUT, its
 `export/mesh-tiles` are drawn, too; a real mesh has holes of its own, so that enclosed pixels of the background are
 counted beside those of the same view in the finest tiles alone.
 
@@ -25,7 +25,6 @@ from PIL import Image
 from playwright.sync_api import Page
 
 from splatpipe.pipeline.engine.files.json_file import read_json
-from splatpipe.pipeline.splat.containers.glb_container import open_container
 from splatpipe.pipeline.splat.model.scene import SplatOrigin
 from splatpipe.pipeline.surface.levels.mesh_tiles import write_mesh_tiles
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin, Similarity
@@ -33,7 +32,11 @@ from splatpipe.pipeline.survey.crs.frames import Frame, Origin, Similarity
 BACKGROUND = "#ff00ff"
 PLACE = Origin(52.2, 21.0, 150.0)
 MIXED, FINEST = 16.0, 0.0  # largest errors of tiles on the screen, pixels
-VIEWS = [((-0.48, -0.48, 0.06), (0.3, 0.3, 0.0)), ((0.0, -0.55, 0.1), (0.0, 0.2, 0.0)), ((0.4, 0.4, 0.05), (-0.4, -0.2, 0.0))]
+VIEWS = [
+    ((-0.48, -0.48, 0.06), (0.3, 0.3, 0.0)),
+    ((0.0, -0.55, 0.1), (0.0, 0.2, 0.0)),
+    ((0.4, 0.4, 0.05), (-0.4, -0.2, 0.0)),
+]
 """Viewpoints and targets, in sides of the site from its middle."""
 MAX_GAPS = 0
 
@@ -61,7 +64,7 @@ def check_made(folder: Path, modules: Path, pictures: Path | None) -> int:
     tiles = folder / "tiles"
     tiles.mkdir()
     frame = Frame("enu", Similarity.identity(), PLACE, "ellipsoidal", crs="EPSG:32634")
-    summary = write_mesh_tiles(tiles, made, frame, folder / "work", lambda done, total: None)
+    summary = write_mesh_tiles(tiles, made, frame, folder / "work", _tell_nothing)
     print(f"made site: {summary.tiles} tiles in {summary.levels} levels, {summary.triangles:,} triangles")
     total = 0
     with opened(tiles, modules) as (page, heard):
@@ -78,6 +81,10 @@ def check_made(folder: Path, modules: Path, pictures: Path | None) -> int:
     return total
 
 
+def _tell_nothing(_done: int, _total: int) -> None:
+    pass
+
+
 def check_run(out: Path, modules: Path, pictures: Path | None) -> None:
     """Print the enclosed background of a run's tiles, in mixed levels and in the finest alone."""
     tiles = out / "export/mesh-tiles"
@@ -87,7 +94,7 @@ def check_run(out: Path, modules: Path, pictures: Path | None) -> None:
     lies = SplatOrigin(origin["latitude"], origin["longitude"], origin["height_m"])
     with opened(tiles, modules) as (page, heard):
         place(page, lies)
-        page.evaluate("() => { enu = Cesium.Matrix4.fromArray(tileset.root.transform ? Cesium.Matrix4.pack(tileset.root.transform, []) : []); }")
+        page.evaluate("() => { enu = Cesium.Matrix4.clone(tileset.root.transform); }")  # views are in the tiles' frame
         for number, (eye, target) in enumerate(VIEWS):
             eye_m, target_m = centre + 2.0 * half * np.array(eye), centre + 2.0 * half * np.array(target)
             eye_m[2] = centre[2] + half[2] + 0.1 * half[:2].max()

@@ -1,9 +1,10 @@
 """3D Tiles 1.1 of a georeferenced splat for CesiumJS: a tileset of LOD levels whose tiles are glTF with embedded SPZ.
 
 Specifications: those of `tileset.py`; Khronos, "KHR_gaussian_splatting" and its
-"KHR_gaussian_splatting_compression_spz_2". What they leave open follows CesiumJS 1.145: the tileset lists both glTF extensions as required, or its tiles are drawn as points; the
-scene's first node holds the splat and a matrix; the SPZ file must use the glTF's axes, y up; there is an attribute for
-each SH coefficient except the constant one, which is COLOR_0, and none for opacities.
+"KHR_gaussian_splatting_compression_spz_2". What they leave open follows CesiumJS 1.145: the tileset lists both glTF
+extensions as required, or its tiles are drawn as points; the scene's first node holds the splat and a matrix; the SPZ
+file must use the glTF's axes, y up; there is an attribute for each SH coefficient except the constant one, which is
+COLOR_0, and none for opacities.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.output_file import new_file, own_folder, write_file
 from splatpipe.pipeline.splat.containers.glb_container import FLOAT, UNSIGNED_BYTE, padded, write_head
 from splatpipe.pipeline.splat.containers.spz_encoder import FIRST_THREE_VERSION, spz_bytes
-from splatpipe.pipeline.splat.formats.glb_splats import EXTENSION, KERNEL, RECORD, SPZ_EXTENSION, harmonics_names
+from splatpipe.pipeline.splat.formats.glb_splats import EXTENSION, KERNEL, SPZ_EXTENSION, harmonics_names
 from splatpipe.pipeline.splat.levels.levels import LevelNode
 from splatpipe.pipeline.splat.levels.tileset import TILESET, EsriCrs, TilesetTile, column_major, tileset_text
 from splatpipe.pipeline.splat.model.gaussians import Gaussians

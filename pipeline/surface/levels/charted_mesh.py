@@ -34,7 +34,9 @@ class ChartedMesh:
     def joined(self, *others: ChartedMesh) -> ChartedMesh:
         """These triangles and those of other parts of the same mesh."""
         every = (self, *others)
-        arrays = (np.concatenate([getattr(each, name) for each in every]) for name in ("triangles", "corners", "charts"))
+        arrays = (
+            np.concatenate([getattr(each, name) for each in every]) for name in ("triangles", "corners", "charts")
+        )
         return ChartedMesh(self.vertices, *arrays)
 
     def wedges(self) -> tuple[Int64[np.ndarray, " w"], Int64[np.ndarray, "m 3"]]:
@@ -67,7 +69,9 @@ def _cut(mesh: ChartedMesh, axis: int, line: float) -> ChartedMesh:
     if not crossed.any():
         return mesh
     part, side = mesh.select(crossed), side[crossed]
-    alone = np.where((side == 0).any(axis=1), np.argmin(np.abs(side), axis=1), np.argmax(side == -_majority(side), axis=1))
+    alone = np.where(
+        (side == 0).any(axis=1), np.argmin(np.abs(side), axis=1), np.argmax(side == -_majority(side), axis=1)
+    )
     turn = (alone[:, None] + np.arange(3)) % 3
     part = ChartedMesh(
         mesh.vertices,

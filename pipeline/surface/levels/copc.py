@@ -21,7 +21,7 @@ import numpy as np
 from laspy.vlrs.known import LasZipVlr
 from laspy.vlrs.vlr import VLR
 
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.surface.levels.cloud_file import cloud_pieces, open_cloud
@@ -73,7 +73,8 @@ def write_copc(source: Path, path: Path, work: Path, progress: Callable[[int, in
 
     Raises:
         SplatpipeError: if the source is no such file.
-        OSError: if the disk is full or not writable.
+        MachineError: if the disk is full.
+        OSError: if it is not writable.
     """
     shutil.rmtree(work, ignore_errors=True)  # of a killed run
     work.mkdir(parents=True)
@@ -93,6 +94,8 @@ def write_copc(source: Path, path: Path, work: Path, progress: Callable[[int, in
         octree = PointOctree(cube, counts, piles, header.point_format.dtype())
         with whole_file(path) as aside, new_file(aside) as file:
             return _write(file, header, cube, octree.nodes(), progress)
+    except lazrs.LazrsError as error:
+        raise MachineError(f"{path} cannot be written: {error}", "Is there space on the disk?") from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
 

@@ -30,7 +30,7 @@ from splatpipe.pipeline.surface.levels.web_mercator import (
     pixel_m,
 )
 from splatpipe.pipeline.surface.rasters.geotiff import GDAL_ERRORS, gdal, open_raster
-from splatpipe.pipeline.surface.rasters.map_crs import MapCrs, open_map
+from splatpipe.pipeline.surface.rasters.map_crs import open_map
 from splatpipe.pipeline.surface.rasters.pictures import relief_picture, shaded_relief
 from splatpipe.pipeline.survey.crs.frames import Frame
 
@@ -141,9 +141,7 @@ def _place_of(raster: rasterio.DatasetReader, frame: Frame) -> MapPlace:
     return MapPlace(crs, cells_from_crs, box, (box[1] + box[3]) / 2.0)
 
 
-def _task(
-    raster: rasterio.DatasetReader, place: MapPlace, paint: Paint, progress: Callable[[int, int], None]
-) -> _Task:
+def _task(raster: rasterio.DatasetReader, place: MapPlace, paint: Paint, progress: Callable[[int, int], None]) -> _Task:
     pixel = abs(raster.transform.a) * place.crs.unit_m
     scale = place.crs.world.grid_scale() if place.crs.world is not None else None
     on_ground = pixel / (1.0 if scale is None else scale.ground)
@@ -199,20 +197,20 @@ def _unmultiplied(whole: Float32[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w
     return np.rint(np.clip(np.concatenate([colours, alpha], axis=2), 0.0, 255.0)).astype(np.uint8)
 
 
-Values = Callable[[np.ndarray, np.ndarray], Float32[np.ndarray, "h w c"]]
+Values = Callable[[np.ma.MaskedArray], Float32[np.ndarray, "h w c"]]
 
 
-def _colours_of(bands: np.ndarray, known: np.ndarray) -> Float32[np.ndarray, "h w 4"]:
+def _colours_of(bands: np.ma.MaskedArray) -> Float32[np.ndarray, "h w 4"]:
     """Colours multiplied by alpha, and alpha."""
-    whole = bands.transpose(1, 2, 0).astype(np.float32)
+    whole = bands.data.transpose(1, 2, 0).astype(np.float32)
     whole[..., :3] *= whole[..., 3:] / 255.0
     return whole
 
 
-def _heights_of(bands: np.ndarray, known: np.ndarray) -> Float32[np.ndarray, "h w 2"]:
+def _heights_of(bands: np.ma.MaskedArray) -> Float32[np.ndarray, "h w 2"]:
     """Heights multiplied by whether they are known, and that."""
-    share = known[0].astype(np.float32)
-    return np.dstack([np.where(known[0], bands[0], 0.0).astype(np.float32), share])
+    known = ~np.ma.getmaskarray(bands)[0]
+    return np.dstack([np.where(known, bands.data[0], 0.0).astype(np.float32), known.astype(np.float32)])
 
 
 def _sampled(
@@ -223,7 +221,7 @@ def _sampled(
     Args:
         raster: An open raster.
         cells: Columns and rows; the first cell's centre is (0.5, 0.5).
-        values: From a window's bands, and where they are known, to what is interpolated.
+        values: From a window's bands to what is interpolated.
     """
     low = np.floor(cells.min(axis=(0, 1))).astype(int) - 1
     high = np.ceil(cells.max(axis=(0, 1))).astype(int) + 1
@@ -231,8 +229,7 @@ def _sampled(
     if (low >= high).any():
         return np.zeros((*cells.shape[:2], raster.count if raster.count > 1 else 2), np.float32)
     window = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
-    bands = raster.read(window=window, masked=True)
-    found = values(bands.data, ~np.ma.getmaskarray(bands))
+    found = values(raster.read(window=window, masked=True))
     at = (cells - low - 0.5).astype(np.float32)
     edge = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": 0}
     return np.asarray(cv2.remap(found, at[..., 0], at[..., 1], cv2.INTER_LINEAR, **edge))

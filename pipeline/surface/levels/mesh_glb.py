@@ -49,11 +49,12 @@ def write_part(path: Path, mesh: ChartedMesh, places: Float32[np.ndarray, "n 3"]
             file.write(part + b"\0" * (padded(len(part)) - len(part)))
 
 
-def _document(positions: Float32[np.ndarray, "n 3"], indices: int, number: np.dtype, lengths: list[int]) -> dict[str, Any]:
+def _document(
+    positions: Float32[np.ndarray, "n 3"], indices: int, number: np.dtype, lengths: list[int]
+) -> dict[str, Any]:
     starts = np.concatenate([[0], np.cumsum([padded(length) for length in lengths])]).tolist()
     views: list[dict[str, Any]] = [
-        {"buffer": 0, "byteOffset": start, "byteLength": length}
-        for start, length in zip(starts, lengths, strict=False)
+        {"buffer": 0, "byteOffset": start, "byteLength": length} for start, length in zip(starts, lengths, strict=False)
     ]
     for view, target in zip(views, (ARRAY, ARRAY, ELEMENTS), strict=False):
         view["target"] = target

@@ -87,7 +87,9 @@ class _Pieces:
     sizes: Int64[np.ndarray, "c 2"]
 
 
-def packed_texture(mesh: ChartedMesh, rects: Int64[np.ndarray, "c 5"], pages: TexturePages, factor: int) -> PackedTexture:
+def packed_texture(
+    mesh: ChartedMesh, rects: Int64[np.ndarray, "c 5"], pages: TexturePages, factor: int
+) -> PackedTexture:
     """Cut out and reduce what a part of a mesh shows of its pages.
 
     Args:

@@ -28,7 +28,7 @@ from splatpipe.pipeline.survey.crs.frames import Frame
 from splatpipe.pipeline.survey.crs.world import Placement, open_world
 
 TILES = "tiles"
-# Viewers show a tile up to an error of 16 pixels (CesiumJS's default): its texture's pixels are then as large as theirs.
+# Viewers show a tile up to an error of 16 pixels, CesiumJS's default: its texture's pixels are then as large as theirs
 ERROR_PIXELS = 16.0
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Int64
 
 CELLS = 128  # cells of a node's grid, per side
-MAX_LEVEL = 16  # of a node; deeper ones would divide single steps of a cloud some 60 m across
+MAX_LEVEL = 16  # of a node: in a cloud that is 1 km across with steps of a millimetre it has a side of 15 mm
 MAX_LEAF_POINTS = 65_536  # a node with more is divided: some 400 kB in a file, a good size for a request
 COUNTED_LEVEL = 7  # of the cubes in which points are counted before they are distributed
 MAX_PILE_POINTS = 1 << 20  # points that are in memory at a time, 40 bytes each and as much for sorting them
@@ -59,7 +59,7 @@ class Cube:
 
     Attributes:
         lowest: Its lowest corner, steps.
-        side: Its side, steps: a multiple of 2 to the power of ``MAX_LEVEL``, or of a smaller cloud's own size.
+        side: Its side, steps: a multiple of 2 to the power of ``deepest``.
         deepest: The level at which cubes still have whole sides.
     """
 
@@ -100,7 +100,7 @@ class Piles:
 
     Args:
         cube: The root's cube.
-        counts: Number of points in each cube of ``COUNTED_LEVEL``, or of the deepest if that is above it.
+        counts: Of all points.
         folder: For the files.
     """
 
@@ -121,7 +121,7 @@ class Piles:
                 file.write(records[rows].tobytes())
 
     def take(self, key: NodeKey, kind: np.dtype) -> Records | None:
-        """The points of a cube that is a pile, in the order in which they came; None if it is none. Its file is removed.
+        """The points of a cube that is a pile, in the order in which they came; None if it is none. Its file goes.
 
         Args:
             key: The cube.
@@ -237,7 +237,7 @@ def nearest_to_centres(cube: Cube, records: Records, level: int) -> Int64[np.nda
     """
     cells = cube.cells(records, level)
     cells -= cells.min(axis=0)
-    x, y, z = (int(size) + 1 for size in cells.max(axis=0))
+    x, y, _ = (int(size) + 1 for size in cells.max(axis=0))
     number = (cells[:, 2] * y + cells[:, 1]) * x + cells[:, 0]
     order = np.lexsort((np.arange(len(records)), cube.from_centre(records, level), number))
     first = np.ones(len(order), np.bool_)

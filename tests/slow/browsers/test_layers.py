@@ -140,7 +140,9 @@ def test_keys_choose_and_buttons_are_reached_by_tab(view: Opened) -> None:
     assert pressed(page) == ["Splat"]
     for key, name in (("2", "Mesh"), ("3", "Points"), ("1", "Splat")):
         page.keyboard.press(key)
-        page.wait_for_function("name => document.querySelector('#layers [aria-pressed=true]')?.innerText === name", arg=name)
+        page.wait_for_function(
+            "name => document.querySelector('#layers [aria-pressed=true]')?.innerText === name", arg=name
+        )
     page.locator("#splat_layer").focus()
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")

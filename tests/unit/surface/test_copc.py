@@ -81,7 +81,7 @@ def test_a_window_has_exactly_the_points_in_it(source: Path) -> None:
     every = laspy.read(source)
     with laspy.CopcReader.open(source.with_name("cloud.copc.laz")) as reader:
         middle = np.round((every.header.mins + every.header.maxs) / 2.0, 2) + 0.0005  # between steps
-        low, high = middle - [4.0, 3.0, 50.0], middle + [2.0, 5.0, 50.0]
+        low, high = middle - np.array([4.0, 3.0, 50.0]), middle + np.array([2.0, 5.0, 50.0])
         found = reader.query(bounds=laspy.copc.Bounds(mins=low, maxs=high))
         inside = ((every.xyz >= low) & (every.xyz <= high)).all(axis=1)
         np.testing.assert_array_equal(in_order(found.array), in_order(every.points.array[inside]))

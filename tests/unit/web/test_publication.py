@@ -47,7 +47,9 @@ def test_every_format_is_written_and_a_second_call_writes_nothing(products: RunP
     report = tiny_scene.Recorder()
     made = write_publication(SURFACE_FORMATS, products, tmp_path / "export", tmp_path / "work", report)
     names = sorted(path.name for path in (tmp_path / "export").iterdir())
-    assert names == ["cloud.copc.laz", "dsm.mbtiles", "mesh-tiles", "ortho.mbtiles"] and list(made) == [*SURFACE_FORMATS]
+    assert names == ["cloud.copc.laz", "dsm.mbtiles", "mesh-tiles", "ortho.mbtiles"] and list(made) == [
+        *SURFACE_FORMATS
+    ]
     assert not (tmp_path / "work").exists() and all(each["bytes"] > 1000 for each in made.values())
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "export").rglob("*")}
     again = write_publication(SURFACE_FORMATS, products, tmp_path / "export", tmp_path / "work", report)
@@ -111,7 +113,9 @@ def test_thinning_is_even_and_keeps_colours(products: RunProducts) -> None:
     cloud, every = thinned_cloud(products.cloud, 500), laspy.read(products.cloud)
     assert 150 < len(cloud.coordinates) <= 500
     known = {tuple(place): tuple(colour) for place, colour in zip(every.xyz.tolist(), colours_of(every), strict=True)}
-    assert all(known[tuple(p)] == tuple(c) for p, c in zip(cloud.coordinates.tolist(), cloud.colours.tolist(), strict=True))
+    assert all(
+        known[tuple(p)] == tuple(c) for p, c in zip(cloud.coordinates.tolist(), cloud.colours.tolist(), strict=True)
+    )
     low = every.header.mins[:2]
     cells = np.unique(np.floor((cloud.coordinates[:, :2] - low) / (SITE_M / 10.0)), axis=0)
     assert len(cells) >= 100  # of 100, none is empty
