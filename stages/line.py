@@ -13,7 +13,7 @@ from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, DtmConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
-from splatpipe.pipeline.web.options import ExportConfig
+from splatpipe.pipeline.web.options import ExportConfig, PublishConfig
 
 INGEST = Stage(
     "ingest",
@@ -206,7 +206,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=10,
+    version=11,
     config=ExportConfig,
     reads=(
         "clean.model",
@@ -341,6 +341,16 @@ MESH = Stage(
     resumable=True,
     deliverables=("files",),
 )
+PUBLISH = Stage(
+    "publish",
+    version=1,
+    config=PublishConfig,
+    reads=("georef.frame", "dsm.files", "ortho.files", "cloud.files", "mesh.files", "mesh.textured"),
+    parts={"files": "files", "viewer": "viewer"},
+    entry="splatpipe.stages.publish:run",
+    resumable=True,
+    deliverables=("files",),
+)
 
 LINE = (
     INGEST,
@@ -367,4 +377,5 @@ LINE = (
     FACADES,
     CLOUD,
     MESH,
+    PUBLISH,
 )

@@ -13,7 +13,7 @@ from splatpipe.pipeline.surface.options import CloudConfig, DsmConfig, DtmConfig
 from splatpipe.pipeline.survey.options import ControlConfig, GeorefConfig, TargetsConfig
 from splatpipe.pipeline.train.blocks.options import BlocksConfig
 from splatpipe.pipeline.train.options import SplatDepthsConfig, TrainConfig
-from splatpipe.pipeline.web.options import ExportConfig
+from splatpipe.pipeline.web.options import ExportConfig, PublishConfig
 
 
 class LineConfig(StageConfig):
@@ -43,3 +43,4 @@ class LineConfig(StageConfig):
     facades: FacadesConfig = FacadesConfig()
     cloud: CloudConfig = CloudConfig()
     mesh: MeshConfig = MeshConfig()
+    publish: PublishConfig = PublishConfig()

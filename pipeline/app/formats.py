@@ -8,32 +8,55 @@ from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
-from splatpipe.pipeline.web.options import FORMATS, parse_formats
+from splatpipe.pipeline.web.options import (
+    FORMATS,
+    SURFACE_FORMATS,
+    parse_any_formats,
+    parse_formats,
+    parse_surface_formats,
+)
 from splatpipe.stages.line import GEOREF, LINE
 from splatpipe.stages.options import LineConfig
 
 if TYPE_CHECKING:
     from splatpipe.pipeline.splat.formats.catalogue import SplatFormat
 
-NEED_METRES, NEED_PLACE = {"laz"}, {"tiles"}
+NEED_METRES, NEED_PLACE = {"laz", "copc"}, {"tiles", "mesh-tiles", "mbtiles"}
+NEED_PRODUCTS = {
+    "mesh-tiles": ("mesh", ("mesh/mesh.glb",)),
+    "copc": ("cloud", ("cloud.laz",)),
+    "mbtiles": ("ortho", ("ortho.tif", "dsm.tif")),
+}
+"""Formats of surface products: the product, and its files in OUT, of which one suffices."""
 
 
 def with_formats(out: Path, formats: str) -> dict[str, Any]:
-    """The option that adds formats to those that a run already exports.
+    """The options that add formats to those that a run already exports.
 
     Raises:
         UsageError: if there is no such format.
     """
-    before = open_run_folder(out, LINE).config(LineConfig)[1].export.formats
-    return {"export": {"formats": ",".join(dict.fromkeys((*parse_formats(before), *_parse_names(formats))))}}
+    config, asked = open_run_folder(out, LINE).config(LineConfig)[1], _parse_names(formats)
+    before = {"export": parse_formats(config.export.formats), "publish": parse_surface_formats(config.publish.formats)}
+    every = {"export": FORMATS, "publish": SURFACE_FORMATS}
+    names = {stage: [name for name in known if name in (*before[stage], *asked)] for stage, known in every.items()}
+    return {stage: {"formats": ",".join(found)} for stage, found in names.items()}
 
 
 def check_possible(out: Path, formats: str) -> None:
     """Check that a run can be exported to formats before anything starts.
 
     Raises:
-        SplatpipeError: if the run has no scale or is not georeferenced, and a format needs it.
+        SplatpipeError: if the run has no scale or is not georeferenced, and a format needs it; or if it has not made
+            the product that a format is of.
     """
+    for name in _parse_names(formats):
+        product, files = NEED_PRODUCTS.get(name, ("", ()))
+        if files and not any((out / file).is_file() for file in files):
+            raise SplatpipeError(
+                f"{name} is made from {files[0]}, which this run does not have.",
+                hint=f"Make it first: splatpipe surface {out} --products {product}",
+            )
     from splatpipe.pipeline.survey.crs.frames import load_frame
 
     part = open_run_folder(out, LINE).lineage(GEOREF).get("georef.frame")
@@ -50,11 +73,11 @@ def check_possible(out: Path, formats: str) -> None:
 
 def _parse_names(text: str) -> tuple[str, ...]:
     try:
-        names = parse_formats(text)
+        names = parse_any_formats(text)
     except ValueError as error:
         raise UsageError(f"--format: {error}.") from error
     if not text.strip(", "):
-        raise UsageError("No format is given.", hint=f"Choose from: {', '.join(FORMATS)}.")
+        raise UsageError("No format is given.", hint=f"Choose from: {', '.join((*FORMATS, *SURFACE_FORMATS))}.")
     return names
 
 

@@ -1,12 +1,15 @@
-"""Adds measurements on the surface model to OUT/viewer.html and OUT/web/index.html.
+"""Adds what is made after the splat to OUT/viewer.html and OUT/web/index.html: measurements, mesh and points.
 
 The stage `export` writes the page before there is a surface model, and sections can be cut on a finished run at any
-time. So measurements are put into the copy of the page in OUT; the artifact itself is unchanged. The page keeps its
-mtime, so that the store still recognises it as that copy (``is_copy``), and the same state gives the same bytes.
+time. So these are put into the copy of the page in OUT; the artifact itself is unchanged. The page keeps its mtime, so
+that the store still recognises it as that copy (``is_copy``), and the same state gives the same bytes. A site gets the
+mesh and the points as a file beside the page, which loads it when they are first shown.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,19 +17,31 @@ from typing import IO, Any
 
 from splatpipe.pipeline.app.measurements import has_measurements, is_number, read_measurements, title_of
 from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.files.output_file import is_inside
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
-from splatpipe.pipeline.web.measured_page import PAGE, SITE_PAGE, with_measurements
+from splatpipe.pipeline.web import script_safe
+from splatpipe.pipeline.web.measured_page import (
+    PAGE,
+    SITE_PAGE,
+    SURFACES,
+    SURFACES_BEGIN,
+    with_measurements,
+    with_surfaces,
+)
 
 SECTION_FIGURES = ("length_m", "share_with_height")
 VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3", "net_sigma_m3", "area_m2")
 PLACES = ("x", "y", "z")
+LAYERS = ("mesh", "points")  # of `surfaces.json`
+MAX_SURFACES_BYTES = 64 << 20  # bytes: five times the largest that `publish` writes
+DIGEST_CHARACTERS = 16  # hexadecimal digits, enough to be unique within a site
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
 MAX_COORDINATE_M = 1e9  # metres: larger coordinates are not on the earth, and a chart's steps are lost in rounding
 
 
 def update_viewer(out: Path) -> str:
-    """Update the viewers in OUT to show exactly the measurements that are still valid.
+    """Update the viewers in OUT to show exactly the measurements, mesh and points that are still valid.
 
     Only the holder of OUT's lock may call this.
 
@@ -41,24 +56,69 @@ def update_viewer(out: Path) -> str:
     """
     own = [name for name in (PAGE, SITE_PAGE) if is_inside(out, Path(name)) and not (out / name).is_symlink()]
     pages = [name for name in own if (out / name).is_file()]
-    if not pages or not has_measurements(out):
+    if not pages:
         return ""
-    measurements, trouble = displayed_measurements(out), ""
+    surfaces = displayed_surfaces(out)
+    measurements, trouble = displayed_measurements(out) if has_measurements(out) else None, ""
     for name in pages:
         try:
-            _update(out / name, measurements)
+            beside = None if name == PAGE else (out / name).with_name(SURFACES)
+            _update(out / name, measurements, _surfaces_of_page(surfaces, beside))
         except ValueError:
-            trouble = (
-                f"{name} was written by an earlier version and cannot show measurements; update it with: "
-                f"splatpipe stage export {out}"
-            )
+            if measurements is not None or surfaces is not None:
+                trouble = (
+                    f"{name} was written by an earlier version and cannot show all results; update it with: "
+                    f"splatpipe stage export {out}"
+                )
     return trouble
 
 
-def _update(path: Path, measurements: Mapping[str, Any] | None) -> None:
-    """Put measurements into a page without changing its mtime; a page that already shows them is left alone."""
+def _surfaces_of_page(surfaces: Mapping[str, Any] | None, beside: Path | None) -> bytes | None:
+    """What a page needs to show the mesh and the points; None if there are none.
+
+    Args:
+        surfaces: From ``displayed_surfaces``.
+        beside: A file for it beside the page; None to put it into the page.
+    """
+    if surfaces is None:
+        if beside is not None:
+            beside.unlink(missing_ok=True)
+        return None
+    layers = {"layers": list(surfaces)}
+    if beside is None:
+        return _json({**layers, **surfaces})
+    data = _json(surfaces)
+    if not (beside.is_file() and not beside.is_symlink() and beside.read_bytes() == data):
+        write_durably(beside, data.decode("ascii"))
+    return _json({**layers, "address": f"{beside.name}?v={hashlib.sha256(data).hexdigest()[:DIGEST_CHARACTERS]}"})
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return script_safe(json.dumps(value, separators=(",", ":"), allow_nan=False)).encode("ascii")
+
+
+def displayed_surfaces(out: Path) -> dict[str, Any] | None:
+    """The mesh and the points to show, those of the page's run and frame. None if there are none."""
+    from splatpipe.stages.line import EXPORT, LINE, PUBLISH
+
+    run = open_run_folder(out, LINE)
+    published, of_page = run.lineage(PUBLISH), run.lineage(EXPORT)
+    part, frames = published.get("publish.viewer"), [parts.get("georef.frame") for parts in (published, of_page)]
+    if part is None or None in frames or len({frame.digest for frame in frames if frame is not None}) != 1:
+        return None
+    try:
+        found = read_json(part.path / SURFACES, MAX_SURFACES_BYTES)
+    except (OSError, ValueError):  # it was not made, or somebody else's is damaged
+        return None
+    surfaces = {layer: found[layer] for layer in LAYERS if layer in found} if isinstance(found, dict) else {}
+    return surfaces or None
+
+
+def _update(path: Path, measurements: Mapping[str, Any] | None, surfaces: bytes | None) -> None:
+    """Put results into a page without changing its mtime; a page that already shows them is left alone."""
     page = path.read_bytes()
     updated = with_measurements(page, measurements)
+    updated = updated if surfaces is None and SURFACES_BEGIN not in updated else with_surfaces(updated, surfaces)
     if updated == page:
         return
     stamp = path.stat()

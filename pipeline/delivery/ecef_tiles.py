@@ -10,7 +10,8 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.delivery.delivery_frame import frame_of
 from splatpipe.pipeline.splat.levels.levels import LevelNode
-from splatpipe.pipeline.splat.levels.tiles import EsriCrs, box_z_up, require_georeference, write_tiles
+from splatpipe.pipeline.splat.levels.tiles import box_z_up, require_georeference, write_tiles
+from splatpipe.pipeline.splat.levels.tileset import EsriCrs
 from splatpipe.pipeline.splat.model.scene import Scene
 from splatpipe.pipeline.survey.crs.crs import ELLIPSOIDAL
 from splatpipe.pipeline.survey.crs.world import Placement, World, open_world

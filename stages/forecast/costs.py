@@ -124,6 +124,7 @@ STAGES = {
     "facades": StageCosts(1.0, {"pixels": 1}, 0.8, 1000e6, {}, {"pixels": 0.2e6}),
     "cloud": StageCosts(2.0, {"pixels": 1}, 0.9, 1500e6, {}, {"pixels": 0.5e6}),
     "mesh": StageCosts(2.0, {"pixels": 1}, 0.5, 2800e6, {}, {"pixels": 0.5e6}),
+    "publish": StageCosts(0.05, {"pixels": 1}, 0.0, 600e6, {}, {"pixels": 0.1e6}),
 }
 """CPU seconds at sizes of 1, exponents, parallel share, resident bytes, bytes of memory and of output by size."""
 SCRATCH: Mapping[str, Sizes] = MappingProxyType(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from splatpipe.pipeline.app.report.facts.wording import count, judged_of, length, number, plural, share
+from splatpipe.pipeline.app.report.facts.wording import count, judged_of, length, number, plural, share, size
 from splatpipe.pipeline.engine.stage import Summary, stage_name
 
 Figures = Mapping[str, Any]
@@ -204,6 +204,12 @@ def _mesh(facts: Figures) -> str:
     return f"{count(facts['triangles'])} triangles, textures of {facts['texture_pixels'] / 1e6:.0f} megapixels"
 
 
+def _publish(facts: Figures) -> str:
+    made = [*(f"{name} ({size(each['bytes'])})" for name, each in facts["formats"].items())]
+    shown = f"viewer: splat, {' and '.join(facts['viewer'])}" if facts["viewer"] else ""
+    return ", ".join(filter(None, (*made, shown))) or "nothing to publish"
+
+
 SENTENCES: Mapping[str, Callable[[Figures], str]] = {
     "ingest": _ingest,
     "control": _control,
@@ -229,4 +235,5 @@ SENTENCES: Mapping[str, Callable[[Figures], str]] = {
     "facades": _facades,
     "cloud": _cloud,
     "mesh": _mesh,
+    "publish": _publish,
 }

@@ -1,18 +1,17 @@
 """3D Tiles 1.1 of a georeferenced splat for CesiumJS: a tileset of LOD levels whose tiles are glTF with embedded SPZ.
 
-Specifications: OGC 22-025r4, "3D Tiles 1.1"; Khronos, "KHR_gaussian_splatting" and its
-"KHR_gaussian_splatting_compression_spz_2"; Esri's extension `ESRI_crs` (github.com/Esri/3D-tiles). What they leave open
-follows CesiumJS 1.145: the tileset lists both glTF extensions as required, or its tiles are drawn as points; the
-scene's first node holds the splat and a matrix; the SPZ file must use the glTF's axes, y up; there is an attribute for
-each SH coefficient except the constant one, which is COLOR_0, and none for opacities.
+Specifications: those of `tileset.py`; Khronos, "KHR_gaussian_splatting" and its
+"KHR_gaussian_splatting_compression_spz_2". What they leave open follows CesiumJS 1.145: the tileset lists both glTF
+extensions as required, or its tiles are drawn as points; the scene's first node holds the splat and a matrix; the SPZ
+file must use the glTF's axes, y up; there is an attribute for each SH coefficient except the constant one, which is
+COLOR_0, and none for opacities.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,36 +23,16 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.output_file import new_file, own_folder, write_file
 from splatpipe.pipeline.splat.containers.glb_container import FLOAT, UNSIGNED_BYTE, padded, write_head
 from splatpipe.pipeline.splat.containers.spz_encoder import FIRST_THREE_VERSION, spz_bytes
-from splatpipe.pipeline.splat.formats.glb_splats import EXTENSION, KERNEL, RECORD, SPZ_EXTENSION, harmonics_names
+from splatpipe.pipeline.splat.formats.glb_splats import EXTENSION, KERNEL, SPZ_EXTENSION, harmonics_names
 from splatpipe.pipeline.splat.levels.levels import LevelNode
+from splatpipe.pipeline.splat.levels.tileset import TILESET, EsriCrs, TilesetTile, column_major, tileset_text
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import Axes, Scene, SceneFacts, turn_of
 
-TILESET = "tileset.json"
 TILES = "tiles"
 GLTF_CONTENT = "3DTILES_content_gltf"
-ESRI_CRS = "ESRI_crs"
-_STEP_M = 0.001  # step to which boxes are rounded outwards
-_MIN_HALF_M = 0.001  # half side of a box: a zero one has no inverse
 _TILE = re.compile(r"[0-9]+\.glb", re.ASCII)  # names of tiles
 _EXTENSIONS = [EXTENSION, SPZ_EXTENSION]
-
-
-@dataclass(frozen=True, eq=False)
-class EsriCrs:
-    """A projected CRS in which Esri software shows the tiles instead of on the globe.
-
-    Attributes:
-        wkid: Well-known ID, the EPSG code that Esri accepts; None if there is none.
-        wkt: The definition (WKT 2) if there is no ID; else empty.
-        vertical_wkid: ID of the vertical CRS; None if unknown, which Esri interprets as heights above some geoid.
-        crs_from_local: Best-fitting affine map from local metres, z up, to the CRS's units.
-    """
-
-    wkid: int | None
-    wkt: str
-    vertical_wkid: int | None
-    crs_from_local: Float64[np.ndarray, "4 4"]
 
 
 def write_tiles(
@@ -87,13 +66,9 @@ def write_tiles(
         if len(node.gaussians):
             names[node] = f"{TILES}/{number}.glb"
             _write_tile(folder / names[node], node.gaussians, scene.facts)
-    tile = _tile(root, names, scene.facts.axes, esri_crs)
-    tile["transform"] = _column_major(ecef_from_local)
-    if esri_crs is not None:
-        tile["extensions"][ESRI_CRS]["transform"] = _column_major(esri_crs.crs_from_local)
-    tileset = _tileset(tile, root, scene.facts, esri_crs)
-    text = json.dumps(tileset, separators=(",", ":"), allow_nan=False)
-    write_file(folder / TILESET, text)
+    tile = _tile(root, names, scene.facts.axes)
+    content = {GLTF_CONTENT: {"extensionsUsed": _EXTENSIONS, "extensionsRequired": _EXTENSIONS}}
+    write_file(folder / TILESET, tileset_text(tile, ecef_from_local, esri_crs, scene.facts, content))
     _drop_earlier(folder, set(names.values()))
 
 
@@ -128,46 +103,10 @@ def box_z_up(box: Float64[np.ndarray, "2 3"], axes: Axes) -> Float64[np.ndarray,
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
-def _tileset(tile: Mapping[str, Any], root: LevelNode, facts: SceneFacts, esri_crs: EsriCrs | None) -> dict[str, Any]:
-    content = {"extensionsUsed": _EXTENSIONS, "extensionsRequired": _EXTENSIONS}
-    extensions: dict[str, Any] = {GLTF_CONTENT: content}
-    if esri_crs is not None:
-        named = {"wkt2": esri_crs.wkt} if esri_crs.wkid is None else {"wkid": esri_crs.wkid}
-        heights = {} if esri_crs.vertical_wkid is None else {"vcsWkid": esri_crs.vertical_wkid}
-        extensions[ESRI_CRS] = named | heights
-    nothing_drawn = max(root.error, float(np.linalg.norm(root.box[1] - root.box[0])))
-    return {
-        "asset": {"version": "1.1", "generator": "splatpipe", "extras": {RECORD: facts.record()}},
-        "extensionsUsed": list(extensions),
-        "extensions": extensions,
-        "geometricError": nothing_drawn,
-        "root": tile,
-    }
-
-
-def _tile(node: LevelNode, names: Mapping[LevelNode, str], axes: Axes, esri_crs: EsriCrs | None) -> dict[str, Any]:
+def _tile(node: LevelNode, names: Mapping[LevelNode, str], axes: Axes) -> TilesetTile:
     """The tileset's entry for a node and all below it: z up, unlike their glTF."""
-    volume = {"box": _box(box_z_up(node.box, axes))}
-    tile: dict[str, Any] = {"boundingVolume": volume, "geometricError": float(node.error), "refine": "REPLACE"}
-    if node in names:
-        tile["content"] = {"uri": names[node]}
-    if esri_crs is not None:
-        tile["extensions"] = {ESRI_CRS: {"boundingVolume": volume}}
-    if node.children:
-        tile["children"] = [_tile(child, names, axes, esri_crs) for child in node.children]
-    return tile
-
-
-def _box(box: Float64[np.ndarray, "2 3"]) -> list[float]:
-    """Centre and half axes of the box, rounded outwards."""
-    steps = np.stack([np.floor(box[0] / _STEP_M), np.ceil(box[1] / _STEP_M)])
-    centre = np.round(steps.mean(axis=0) * _STEP_M, 6)
-    half = np.round(np.maximum((steps[1] - steps[0]) * (_STEP_M / 2.0), _MIN_HALF_M), 6)
-    return [*centre.tolist(), *np.diag(half).ravel().tolist()]
-
-
-def _column_major(matrix: Float64[np.ndarray, "4 4"]) -> list[float]:
-    return [float(value) for value in matrix.ravel(order="F")]
+    children = tuple(_tile(child, names, axes) for child in node.children)
+    return TilesetTile(box_z_up(node.box, axes), float(node.error), names.get(node), children)
 
 
 def _write_tile(path: Path, gaussians: Gaussians, facts: SceneFacts) -> None:
@@ -210,7 +149,7 @@ def _document(
         "extensionsRequired": _EXTENSIONS,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "matrix": _column_major(matrix)}],
+        "nodes": [{"mesh": 0, "matrix": column_major(matrix)}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": [{"count": len(gaussians), **kind} for kind in kinds.values()],
         "bufferViews": [{"buffer": 0, "byteLength": spz_size}],

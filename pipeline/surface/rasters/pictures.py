@@ -62,10 +62,24 @@ def relief_picture(path: Path, side: int) -> ReliefPicture | None:
     if not known.any() or min(shape) < 2:
         return None
     low, high = (float(each) for each in np.quantile(height[known], [SPREAD, 1.0 - SPREAD]))
+    pixels = np.where(known[..., None], shaded_relief(height, step, low, high), EMPTY)
+    return ReliefPicture(pixels.astype(np.uint8), low, high)
+
+
+def shaded_relief(
+    height: Float64[np.ndarray, "h w"], step: float, low: float, high: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Colours of heights, lit from the north-west; where there is no height they mean nothing.
+
+    Args:
+        height: Heights; NaN where unknown.
+        step: Distance between them, in their unit.
+        low: Height of the first colour.
+        high: Height of the last colour.
+    """
     shade = np.clip((height - low) / max(high - low, 1e-9), 0.0, 1.0)
     colours = matplotlib.colormaps["viridis"](np.nan_to_num(shade))[..., :3] * _light(height, step)[..., None]
-    pixels = np.where(known[..., None], np.clip(colours * 255.0, 0.0, 255.0), EMPTY)
-    return ReliefPicture(pixels.astype(np.uint8), low, high)
+    return np.clip(colours * 255.0, 0.0, 255.0).astype(np.uint8)
 
 
 def _light(height: Float64[np.ndarray, "h w"], step: float) -> Float64[np.ndarray, "h w"]:

@@ -12,6 +12,7 @@
 //   pick(x, y)            [x, y, z]: the world point at a window position, or null
 //   crsOf([x, y, z])      its coordinates in the run's CRS, or null if there is none
 //   measure(from, to, kind = "distance")   {distance, horizontal, height}, drawn like one made by hand
+//   show(layer)           a promise: "splat", "mesh" or "points" is shown, if the run made it; false if it did not
 //   showPoints(on), showCameras(on), showInterface(on)
 //   picture()             a promise: the current view as a PNG data URL
 //   shown()               {gaussians, files}: what is drawn; files of the levels of detail, if any
@@ -23,11 +24,12 @@ import { fillStrip, Frusta, frustumDepth } from "./viewer/cameras.js";
 import { coordinateLabels, toCrs } from "./viewer/crs.js";
 import { LoadError } from "./viewer/error.js";
 import { fetchPatiently } from "./viewer/files.js";
+import { Layers } from "./viewer/layers.js";
 import { readLevels } from "./viewer/levels.js";
 import { Measuring } from "./viewer/measure.js";
 import { acceptFile, loaded, note, progress, showMessage } from "./viewer/messages.js";
 import { Navigation } from "./viewer/navigation.js";
-import { bytesOf, readFacts, readMeasurements, readPoints, readSplat } from "./viewer/page.js";
+import { bytesOf, readFacts, readMeasurements, readPoints, readSplat, readSurfaces } from "./viewer/page.js";
 import { readPart } from "./viewer/part.js";
 import { fillPoints, makePoints, nearestPoint } from "./viewer/points.js";
 import { meet } from "./viewer/ray.js";
@@ -69,6 +71,11 @@ class Viewer {
     this.frusta = new Frusta(this.photos, frustumDepth(this.photos), () => this.stage.invalidate());
     this.measuring = new Measuring($("labels"), $("lines"), facts, () => this.stage.invalidate());
     this.results = this.makeResults();
+    this.layers = new Layers(readSurfaces(), {
+      add: (object) => this.stage.scene.add(object),
+      changed: () => this.showPoints(false),
+      failed: (error) => note(`It cannot be shown: ${error.message}`),
+    });
     this.stage.scene.add(this.frusta.group);
     this.stage.beforeDraw = () => this.beforeDraw();
     this.stage.failed = (error) => showMessage(`Drawing failed: ${error.message}`, "Reload this page, or try another browser.");
@@ -172,10 +179,11 @@ class Viewer {
         this.measuring.undo();
         this.showMeasurement(null);
       },
+      ...this.layers.actions,
       screenshot: () => this.screenshot(),
       help_button: () => ($("help").open ? $("help").close() : $("help").showModal()),
     };
-    const keys = { h: "home", f: "fly", p: "points", c: "cameras", v: "results_button", m: "distance", t: "height", x: "screenshot", "?": "help_button", Backspace: "undo", Delete: "undo" };
+    const keys = { h: "home", f: "fly", p: "points", c: "cameras", v: "results_button", m: "distance", t: "height", x: "screenshot", 1: "splat_layer", 2: "mesh_layer", 3: "points_layer", "?": "help_button", Backspace: "undo", Delete: "undo" };
     for (const [name, action] of Object.entries(actions)) $(name)?.addEventListener("click", action);
     $("close").addEventListener("click", () => $("help").close());
     addEventListener("keydown", (event) => {
@@ -241,6 +249,7 @@ class Viewer {
   pick(x, y) {
     const { view } = this;
     if (this.points.visible) return nearestPoint(this.points, view, x, y);
+    if (this.layers.shown !== "splat") return this.layers.pick(view, x, y);
     const { forward } = view.axes();
     const limits = { near: this.facts.near, pixel: 1 / view.intrinsics().fx };
     return meet(this.parts().map((part) => part.caster), view.position, view.ray(x, y), forward, limits);
@@ -321,7 +330,8 @@ class Viewer {
 
   showPoints(shown) {
     this.points.visible = shown;
-    this.stage.showSplats(!shown);
+    this.layers.hide(shown);
+    this.stage.showSplats(!shown && this.layers.shown === "splat");
     $("points").setAttribute("aria-pressed", String(shown));
   }
 
@@ -377,6 +387,7 @@ class Viewer {
         const { distance, horizontal, height } = this.measuring.add(kind, vector(from), vector(to));
         return { distance, horizontal, height };
       },
+      show: (layer) => this.layers.show(layer),
       showPoints: (on) => this.showPoints(on),
       showCameras: (on) => this.showCameras(on),
       showInterface: (on) => document.body.classList.toggle("bare", !on),

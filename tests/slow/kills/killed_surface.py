@@ -11,16 +11,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from hills import hill_grid
+from hills import hill_grid, placed
+from made_mesh import made_site
 
 from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.files.durable import beside
 from splatpipe.pipeline.surface.heights.contour_files import write_dxf, write_geojson
 from splatpipe.pipeline.surface.heights.contours import Contour, Contours
+from splatpipe.pipeline.surface.levels.copc import write_copc
+from splatpipe.pipeline.surface.levels.map_tiles import write_ortho_tiles
+from splatpipe.pipeline.surface.levels.mesh_tiles import write_mesh_tiles
 from splatpipe.pipeline.surface.rasters.geotiff import COLOURS, CONFIDENCE, HEIGHTS, RasterForm, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.surface.shapes.point_cloud import CloudChunk, CloudFrame, write_cloud
 
 DISK_BYTES = 100_000
+SMALL_BYTES = 1000  # less than any tile of a mesh has
 Halfway = Callable[[], None]
 
 
@@ -71,6 +77,40 @@ def write_lines(path: Path, grid: Grid, halfway: Halfway) -> None:
     (write_dxf(path, contours, grid.crs) if path.suffix == ".dxf" else write_geojson(path, contours, grid))
 
 
+def write_octree(path: Path, grid: Grid, halfway: Halfway) -> None:
+    source = path.with_name(f"source of {path.name}")
+    if not source.is_file():
+        write_points(source, grid, lambda: None)
+    calls: list[int] = []
+    write_copc(source, path, path.with_name(f"work of {path.name}"), lambda done, _: halfway_of(calls, done, halfway))
+
+
+def write_map(path: Path, grid: Grid, halfway: Halfway) -> None:
+    source = path.with_name(f"source of {path.name}.tif")
+    if not source.is_file():
+        write_raster(source, grid, COLOURS, lambda: None)
+    calls: list[int] = []
+    write_ortho_tiles(source, path, placed(), lambda done, _: halfway_of(calls, done, halfway))
+
+
+def write_meshes(path: Path, grid: Grid, halfway: Halfway) -> None:
+    made = path.with_name(f"source of {path.name}")
+    mesh = made_site(made / str(os.getpid()), 50, 512, 20.0)
+    calls: list[int] = []
+    halfway = halfway if halfway is die else lambda: fill_the_disk(SMALL_BYTES)
+    with beside(path) as aside:
+        aside.mkdir()
+        work = path.with_name(f"work of {path.name}")
+        write_mesh_tiles(aside, mesh, placed(), work, lambda done, _: halfway_of(calls, done, halfway))
+
+
+def halfway_of(calls: list[int], done: int, halfway: Halfway) -> None:
+    """Call ``halfway`` the third time that work is reported."""
+    calls.append(done)
+    if len(calls) == 3:
+        halfway()
+
+
 def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -86,6 +126,9 @@ def main(folder: Path) -> None:
         "ortho.tif": lambda path, halfway: write_raster(path, grid, COLOURS, halfway),
         "confidence.tif": lambda path, halfway: fill_late(path, grid, halfway),
         "cloud.laz": lambda path, halfway: write_points(path, grid, halfway),
+        "cloud.copc.laz": lambda path, halfway: write_octree(path, grid, halfway),
+        "ortho.mbtiles": lambda path, halfway: write_map(path, grid, halfway),
+        "mesh-tiles": lambda path, halfway: write_meshes(path, grid, halfway),
         "contours.dxf": lambda path, halfway: write_lines(path, grid, halfway),
         "contours.geojson": lambda path, halfway: write_lines(path, grid, halfway),
     }

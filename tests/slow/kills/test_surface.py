@@ -6,9 +6,12 @@ from pathlib import Path
 
 import rasterio
 from hills import hill_grid, write_hill
-from repository import SCENES, environment
+from repository import ROOT, SCENES, environment
 
-RASTERS, OTHERS = ("dsm.tif", "ortho.tif", "confidence.tif"), ("cloud.laz", "contours.dxf", "contours.geojson")
+RASTERS, OTHERS = (
+    ("dsm.tif", "ortho.tif", "confidence.tif", "ortho.mbtiles", "cloud.copc.laz"),
+    ("cloud.laz", "contours.dxf", "contours.geojson", "mesh-tiles"),
+)
 
 
 PRODUCTS = dict.fromkeys(RASTERS, "MachineError") | dict.fromkeys(OTHERS, "OSError")
@@ -17,7 +20,9 @@ PRODUCTS = dict.fromkeys(RASTERS, "MachineError") | dict.fromkeys(OTHERS, "OSErr
 def test_kills_and_full_disks_leave_no_half_product(tmp_path: Path) -> None:
     program = Path(__file__).parent / "killed_surface.py"
     command = [sys.executable, str(program), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment(SCENES))
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, env=environment(SCENES, ROOT / "benchmarks/formats")
+    )
     said = done.stdout.splitlines()
     for name, error in PRODUCTS.items():
         assert f"{name} {error}" in said and f"{name} fill_the_disk 0 0" in said

@@ -15,10 +15,10 @@ from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.runs.store import Artifact, StageInputs, Store, open_store
 from splatpipe.pipeline.engine.stage import Stage
-from splatpipe.pipeline.web.measured_page import BEGIN, END, with_measurements
-from splatpipe.stages.line import DSM, EXPORT, GEOREF, LINE
+from splatpipe.pipeline.web.measured_page import BEGIN, END, SURFACES, SURFACES_BEGIN, with_measurements
+from splatpipe.stages.line import DSM, EXPORT, GEOREF, LINE, PUBLISH
 
-PLAIN = b"<title>House</title>" + BEGIN + b"null" + END + b"<script>draw()</script>"
+PLAIN = b"<title>House</title>" + BEGIN + b"null" + END + SURFACES_BEGIN + b"null" + END + b"<script>draw()</script>"
 HOSTILE = "</script><script>alert(1)</script>\u202e\u2028"
 TRACE = {
     "distance": [0.0, 1.0, 2.0, 3.0],
@@ -43,6 +43,8 @@ def make(store: Store, stage: Stage, reads: dict[str, str], content: str = "") -
         file.write_text(content + stage.name)
     if stage is EXPORT:
         (partial / "viewer/viewer.html").write_bytes(PLAIN)
+    if stage is PUBLISH:
+        (partial / "viewer" / SURFACES).write_text(content)
     artifact = store.commit(stage, inputs, partial, {}, {})
     store.deliver(artifact, stage)
     return artifact
@@ -120,6 +122,53 @@ def test_the_page_for_web_hosts_shows_the_same(out: Path) -> None:
     (out / "viewer.html").write_bytes(PLAIN)
     assert "web/index.html was written by an earlier version" in update_viewer(out)
     assert embedded(out)["sections"]
+
+
+def publish(out: Path, frame: dict[str, str], surfaces: Any) -> None:
+    make(Store(out), PUBLISH, frame, surfaces if isinstance(surfaces, str) else json.dumps(surfaces))
+
+
+def frame_of(out: Path) -> dict[str, str]:
+    (artifact,) = Store(out).artifacts("georef")
+    return digests(artifact, "georef.frame")
+
+
+def surfaces_in(page: Path) -> Any:
+    return json.loads(page.read_bytes().partition(SURFACES_BEGIN)[2].partition(END)[0])
+
+
+def test_mesh_and_points_are_in_the_page_and_beside_the_sites_page(out: Path) -> None:
+    (out / "web").mkdir()
+    (out / "web/index.html").write_bytes(PLAIN)
+    surfaces = {"points": {"xyz": "AAAA"}, "mesh": {"texture": HOSTILE}, "other": 1}
+    publish(out, frame_of(out), surfaces)
+    assert update_viewer(out) == ""
+    shown = {"mesh": surfaces["mesh"], "points": surfaces["points"]}
+    assert surfaces_in(out / "viewer.html") == {"layers": ["mesh", "points"], **shown}
+    assert (out / "viewer.html").read_text().count("</script>") == PLAIN.decode().count("</script>")
+    site = surfaces_in(out / "web/index.html")
+    assert site["layers"] == ["mesh", "points"] and site["address"].startswith("surfaces.json?v=")
+    assert json.loads((out / "web/surfaces.json").read_text()) == shown
+    assert embedded(out)["sections"]
+    content, stamp = (out / "viewer.html").read_bytes(), (out / "viewer.html").stat()
+    update_viewer(out)
+    assert (out / "viewer.html").stat() == stamp and (out / "viewer.html").read_bytes() == content
+
+
+@pytest.mark.parametrize("surfaces", ["", "no JSON", "[]", "{}"])
+def test_without_mesh_and_points_the_page_has_none(out: Path, surfaces: str) -> None:
+    publish(out, frame_of(out), surfaces)
+    (out / "web").mkdir()
+    (out / "web/index.html").write_bytes(PLAIN)
+    (out / "web/surfaces.json").write_text("of an earlier mesh")
+    assert update_viewer(out) == ""
+    assert surfaces_in(out / "viewer.html") is None and not (out / "web/surfaces.json").exists()
+
+
+def test_a_mesh_in_another_frame_is_not_shown(out: Path) -> None:
+    publish(out, digests(make(Store(out), GEOREF, {}, "moved "), "georef.frame"), {"mesh": {}})
+    update_viewer(out)
+    assert surfaces_in(out / "viewer.html") is None
 
 
 def test_pages_with_different_contents_differ_in_size() -> None:

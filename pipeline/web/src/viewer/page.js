@@ -15,6 +15,11 @@ export function readMeasurements() {
   return JSON.parse(document.getElementById("measurements").textContent);
 }
 
+/** What measured_viewer.py put into the page to show instead of the splat; null if nothing. */
+export function readSurfaces() {
+  return JSON.parse(document.getElementById("surfaces")?.textContent ?? "null");
+}
+
 /** Decode base64 text without blocking the page for long. */
 export async function bytesOf(text, progress = () => {}) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);

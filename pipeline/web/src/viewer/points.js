@@ -1,30 +1,41 @@
-// The sparse points of structure from motion.
+// Point clouds: the sparse points of structure from motion, and the dense cloud.
 
 import { BufferAttribute, BufferGeometry, Points, ShaderMaterial, Vector3 } from "three";
 
 const SIZE_PX = 3.5;
+const NEAREST_PX = 1.5; // of dense points, however far
+const FILL = 1.6; // of the distance between points: diagonals, and slopes seen from above
 const REACH_PX = 10; // from a click
 
-/** Make an empty, hidden point cloud. */
-export function makePoints() {
+/**
+ * Make an empty, hidden point cloud.
+ * @param {number} spacing Distance between points, which they fill when near; 0 if it is not known.
+ */
+export function makePoints(spacing = 0) {
   const geometry = new BufferGeometry();
   const material = new ShaderMaterial({
-    uniforms: { size: { value: SIZE_PX } },
+    uniforms: { size: { value: SIZE_PX }, spacing: { value: spacing }, rows: { value: 1 } },
+    defines: { FILL },
     vertexShader: `
 attribute vec3 rgb;
 varying vec3 colour;
 uniform float size;
+uniform float spacing;
+uniform float rows;
 void main() {
   colour = rgb;
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
-  gl_PointSize = size;
+  gl_PointSize = max(size, 0.5 * FILL * spacing * projectionMatrix[1][1] * rows / gl_Position.w);
 }`,
     fragmentShader: "varying vec3 colour;\nvoid main() { gl_FragColor = vec4(colour, 1.0); }", // unchanged: sRGB
   });
   const points = new Points(geometry, material);
   points.frustumCulled = false;
   points.visible = false;
-  points.onBeforeRender = (renderer) => (material.uniforms.size.value = SIZE_PX * renderer.getPixelRatio());
+  points.onBeforeRender = (renderer) => {
+    material.uniforms.size.value = (spacing ? NEAREST_PX : SIZE_PX) * renderer.getPixelRatio();
+    material.uniforms.rows.value = renderer.domElement.height;
+  };
   return points;
 }
 
@@ -39,9 +50,9 @@ export function nearestPoint(points, view, x, y) {
   const xyz = points.geometry.getAttribute("position")?.array ?? [];
   const { fx, fy, cx, cy } = view.intrinsics();
   const { right, up, forward } = view.axes();
-  const eye = view.position;
+  const eye = view.position.clone().sub(points.position);
   let [best, least] = [-1, Infinity];
-  for (let i = 0; i < xyz.length; i += 3) { // view.project inlined, without its vectors for each of 150,000 points
+  for (let i = 0; i < xyz.length; i += 3) { // view.project inlined, without its vectors for each of 250,000 points
     const [x0, y0, z0] = [xyz[i] - eye.x, xyz[i + 1] - eye.y, xyz[i + 2] - eye.z];
     const depth = x0 * forward.x + y0 * forward.y + z0 * forward.z;
     const across = cx + (fx * (x0 * right.x + y0 * right.y + z0 * right.z)) / depth;
@@ -51,5 +62,5 @@ export function nearestPoint(points, view, x, y) {
     const cost = depth * (1 + off / REACH_PX);
     if (cost < least) [best, least] = [i, cost];
   }
-  return best < 0 ? null : new Vector3().fromArray(xyz, best);
+  return best < 0 ? null : new Vector3().fromArray(xyz, best).add(points.position);
 }

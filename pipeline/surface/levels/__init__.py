@@ -1,0 +1,1 @@
+"""Products in levels of detail: point clouds, maps and meshes that viewers load piece by piece."""
