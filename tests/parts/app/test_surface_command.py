@@ -78,16 +78,23 @@ def test_a_finished_run_is_cut_and_measured(demo_copy: Path, tmp_path: Path) -> 
 
 def test_the_report_shows_heights_and_the_orthophoto(demo_run: Path) -> None:
     page = (demo_run / "report.html").read_text(encoding="utf-8")
-    for text in ('id="surfaces"', 'alt="orthophoto"', 'alt="surface model"', "expected deviation of a height"):
+    for text in (
+        'id="surfaces"',
+        'alt="orthophoto"',
+        'alt="surface model"',
+        'alt="terrain model"',
+        "expected deviation of a height",
+    ):
         assert text in page
 
 
 def test_products_request_their_inputs_and_keep_the_rest() -> None:
-    assert options_for(None, None, None).keys() == {"depths", "dsm", "ortho"}
+    assert options_for(None, None, None).keys() == {"depths", "dsm", "dtm", "ortho"}
     table = options_for("cloud, facades", 0.02, "both")
     assert table["cloud"] == {"enabled": True, "spacing_m": 0.02}
     assert table["facades"] == {"enabled": True, "gsd_m": 0.02}
     assert table["dsm"] == {"enabled": True}
+    assert table["dtm"] == {"enabled": True}  # without the ground, points have no classes
     assert table["splat_depths"] == {"enabled": True}
     assert "ortho" not in table
     assert options_for("dsm", 0.02, "splat")["depths"] == {"enabled": False}

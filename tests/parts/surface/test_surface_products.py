@@ -23,14 +23,15 @@ from splatpipe.pipeline.surface.depths.site_extent import SiteExtent, load_site,
 from splatpipe.pipeline.surface.depths.sources import DepthSource, LruCache, MetricMap
 from splatpipe.pipeline.surface.heights.dsm import DsmTask, make_dsm
 from splatpipe.pipeline.surface.heights.heights import HeightInput, tile_heights
-from splatpipe.pipeline.surface.options import DsmConfig
+from splatpipe.pipeline.surface.options import DsmConfig, DtmConfig
 from splatpipe.pipeline.surface.ortho import ortho as ortho_file
 from splatpipe.pipeline.surface.ortho.ortho import OrthoTask, known_cells, make_ortho
 from splatpipe.pipeline.surface.rasters.grid import make_grid
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 from splatpipe.pipeline.surface.sheets.raster_plane import divide_into_sheets
-from splatpipe.pipeline.survey.crs.frames import Frame, Origin
+from splatpipe.pipeline.survey.crs.frames import Frame, Origin, save_frame
 from splatpipe.stages import dsm as dsm_stage
+from splatpipe.stages import dtm as dtm_stage
 
 FRAME = Frame("arbitrary", Similarity.identity(), metres=True)
 IN_UTM = Frame("enu", Similarity.identity(), Origin(50.1, 14.2, 300.0), "ellipsoidal", crs="EPSG:32633")
@@ -91,7 +92,20 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("products")
     dsm(folder)
     ortho(folder)
+    dtm(folder / "ground", folder / "dsm.tif", DtmConfig())
     return folder
+
+
+def dtm(folder: Path, surface: Path, config: DtmConfig) -> dict[str, Any]:
+    """Run the stage `dtm` on a surface model."""
+    (folder / "dsm").mkdir(parents=True)
+    for name in ("dsm.tif", "dsm_confidence.tif"):
+        (folder / "dsm" / name).write_bytes(surface.with_name(name).read_bytes())
+    save_site(folder / "site.json", site(), CELL_M)
+    save_frame(FRAME, folder / "frame.json")
+    parts = {"dsm.files": "dsm", "dsm.site": "site.json", "georef.frame": "frame.json"}
+    inputs = Inputs({part: folder / name for part, name in parts.items()}, folder, {}, Machine("cpu", 1))
+    return dict(dtm_stage.run(config, inputs, folder, InterruptingReporter()))
 
 
 def centres(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -100,6 +114,10 @@ def centres(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         columns, rows = np.meshgrid(np.arange(raster.width) + 0.5, np.arange(raster.height) + 0.5)
         t = raster.transform
         return raster.read(), t.c + t.a * columns, t.f + t.e * rows
+
+
+def places(east: np.ndarray, north: np.ndarray) -> np.ndarray:
+    return np.stack([east.ravel(), north.ravel(), 0 * east.ravel()], axis=1)
 
 
 def test_a_site_has_the_extent_and_resolution_of_its_photos() -> None:
@@ -174,7 +192,7 @@ def test_a_broken_site_is_refused(tmp_path: Path, text: str) -> None:
 def test_heights_are_in_place_and_end_at_the_boundary(made: Path) -> None:
     (height,), east, north = centres(made / "dsm.tif")
     known = height != -9999.0
-    inside = HOUSE.contains(np.stack([east.ravel(), north.ravel(), 0 * east.ravel()], axis=1)).reshape(east.shape)
+    inside = HOUSE.contains(places(east, north)).reshape(east.shape)
     assert known[inside].mean() > 0.99
     assert not known[~inside].any()
     clear = known & (edge_distance(east, north) > 2 * CELL_M)
@@ -192,8 +210,29 @@ def test_confidence_has_photos_and_millimetres(made: Path) -> None:
 
 
 def test_without_georeference_there_are_cad_contours_and_no_geojson(made: Path) -> None:
-    assert (made / "contours.dxf").stat().st_size > 1000
-    assert not (made / "contours.geojson").exists()
+    assert (made / "ground/files/contours.dxf").stat().st_size > 1000
+    assert not (made / "ground/files/contours.geojson").exists()
+
+
+def test_the_terrain_lies_under_the_house(made: Path) -> None:
+    (height,), east, north = centres(made / "ground/files/dtm.tif")
+    known = height != -9999.0
+    assert known[HOUSE.contains(places(east, north)).reshape(east.shape)].all()
+    assert np.abs(height[known]).max() < 0.1
+    (cover,), _, _ = centres(made / "ground/cover/cover.tif")
+    roof = (np.abs(east) < 4.2) & (np.abs(north) < 3.2)
+    assert (cover[roof] == 6).mean() > 0.9
+
+
+def test_contours_are_of_the_ground_unless_the_surface_is_asked_for(made: Path, tmp_path: Path) -> None:
+    ground = (made / "ground/files/contours.dxf").read_bytes()
+    facts = dtm(tmp_path / "surface", made / "dsm.tif", DtmConfig(contours="dsm"))
+    surface = (tmp_path / "surface/files/contours.dxf").read_bytes()
+    assert facts["contours"] == "surface" and len(surface) > 2 * len(ground)
+    facts = dtm(tmp_path / "none", made / "dsm.tif", DtmConfig(enabled=False))
+    assert facts == {"cells": 0, "contours": "surface"}
+    assert [path.name for path in (tmp_path / "none/files").iterdir()] == ["contours.dxf"]
+    assert (tmp_path / "none/files/contours.dxf").read_bytes() == surface
 
 
 def test_the_orthophoto_is_aligned_with_the_surface_model(made: Path) -> None:

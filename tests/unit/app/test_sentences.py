@@ -47,6 +47,12 @@ SAID = [
     ),
     ("flythrough", {"frames": 0}, "no film"),
     ("dsm", {"cells": 0}, "no surface model"),
+    ("dtm", {"cells": 0}, "no terrain model"),
+    (
+        "dtm",
+        {"cells": 9, "ground_share": 0.84, "building_share": 0.063},
+        "terrain model, 84% of it seen, 6% under buildings",
+    ),
 ]
 
 

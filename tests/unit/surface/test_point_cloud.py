@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -50,6 +51,14 @@ def test_points_are_read_back_where_proj_has_them(tmp_path: Path) -> None:
     assert header.creation_date == date(2024, 5, 17)
     assert (header.mins <= cloud.xyz.min(axis=0)).all() and (header.maxs >= cloud.xyz.max(axis=0)).all()
     assert (np.asarray(cloud.return_number) == 1).all() and list(tmp_path.iterdir()) == [path]
+
+
+def test_classes_are_those_of_las_and_none_is_class_0(tmp_path: Path) -> None:
+    classes = np.arange(600, dtype=np.uint8) % 19
+    chunks = [replace(some_points(600, 1), classes=classes), some_points(50, 2)]
+    write_cloud(tmp_path / "cloud.laz", chunks, CloudFrame.of_grid(hill_grid()))
+    read = np.asarray(laspy.read(tmp_path / "cloud.laz").classification)
+    assert (read[:600] == classes).all() and (read[600:] == 0).all()
 
 
 def test_normals_turn_with_the_grid(tmp_path: Path) -> None:
