@@ -3,8 +3,9 @@
 The mesh of the finished run OUT is coloured again without the held-out photos: with textures, and with colours of its
 vertices. Both are drawn at the views that `evaluate` judged, at the same size, and measured as `evaluate` measures the
 splat's renders, which are taken from the run: over the pixels that the mesh fills, and over all. Pixels without a mesh
-are black. ``shown`` is the share of the view that each fills: for the splat, where it has a median depth. WORK receives the textures and the pictures: ``NAME.photo.png``, ``.splat.png``, ``.textured.png``,
-``.vertices.png``, and ``.shown.png`` (white where the mesh is).
+are black. ``shown`` is the share of the view that each fills: for the splat, where it has a median depth. WORK receives
+the textures and the pictures: ``NAME.photo.png``, ``.splat.png``, ``.textured.png``, ``.vertices.png``, and
+``.shown.png`` (white where the mesh is).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 from mesh_renders import MeshScene, texture_shade, vertex_shade
+from opened_run import OpenedRun, open_run
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
