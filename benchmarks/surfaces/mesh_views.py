@@ -3,8 +3,9 @@
 The mesh of the finished run OUT is coloured again without the held-out photos: with textures, and with colours of its
 vertices. Both are drawn at the views that `evaluate` judged, at the same size, and measured as `evaluate` measures the
 splat's renders, which are taken from the run: over the pixels that the mesh fills, and over all. Pixels without a mesh
-are black. WORK receives the textures and the pictures: ``NAME.photo.png``, ``.splat.png``, ``.textured.png``,
-``.vertices.png``, and ``.shown.png`` (white where the mesh is).
+are black. ``shown`` is the share of the view that each fills: for the splat, where it has a median depth. WORK receives
+the textures and the pictures: ``NAME.photo.png``, ``.splat.png``, ``.textured.png``, ``.vertices.png``, and
+``.shown.png`` (white where the mesh is).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 from mesh_renders import MeshScene, texture_shade, vertex_shade
+from opened_run import OpenedRun, open_run
 from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
@@ -132,7 +134,7 @@ def judged(run: RunMesh) -> list[tuple[str, View]]:
     return [(stems[view.camera.name], view) for view in views if view.camera.name in stems]
 
 
-def draw_views(run: RunMesh, made: TexturedMesh, folder: Path) -> list[Row]:
+def draw_views(run: RunMesh, made: TexturedMesh, splat_run: OpenedRun, folder: Path) -> list[Row]:
     """Draw and measure all judged views; returns a row for each view and kind."""
     scene, frame = MeshScene(made.coloured.mesh), load_frame(run.parts["georef.frame"])
     shades = {"textured": texture_shade(made), "vertices": vertex_shade(made.coloured)}
@@ -146,23 +148,24 @@ def draw_views(run: RunMesh, made: TexturedMesh, folder: Path) -> list[Row]:
         splat = cv2.imread(str(run.parts["evaluate.views"] / f"{stem}.render.png"))
         pictures = {"splat": np.ascontiguousarray(splat[..., ::-1])}
         pictures |= {kind: each.picture for kind, each in drawn.items()}
-        rows += [_row(stem, kind, (pictures[kind], photo, mask), shown) for kind in KINDS]
+        filled = dict.fromkeys(KINDS, float(shown.mean()))
+        filled["splat"] = float((splat_run.median_depth(camera) > 0.0).mean())
+        for kind in KINDS:
+            row: Row = {"view": stem, "of": kind, "shown": filled[kind]}
+            rows.append(row | _figures((pictures[kind], photo, mask), shown))
         for name, picture in {"photo": photo, **pictures, "shown": np.where(shown, 255, 0).astype(np.uint8)}.items():
             cv2.imwrite(str(folder / f"{stem}.{name}.png"), picture[..., ::-1] if picture.ndim == 3 else picture)
     return rows
 
 
-def _row(
-    stem: str,
-    kind: str,
+def _figures(
     pictures: tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None],
     shown: Bool[np.ndarray, "h w"],
 ) -> Row:
+    """Figures over the pixels that the mesh fills, and over all."""
     render, photo, mask = pictures
-    counts = shown if mask is None else shown & mask
-    inside, whole = measure(render, photo, counts), measure(render, photo, mask)
-    row: Row = {"view": stem, "of": kind, "shown": float(shown.mean())}
-    return row | inside | {f"all_{name}": value for name, value in whole.items()}
+    inside, whole = measure(render, photo, shown if mask is None else shown & mask), measure(render, photo, mask)
+    return inside | {f"all_{name}": value for name, value in whole.items()}
 
 
 def measure(
@@ -204,6 +207,22 @@ def judge(means: list[Row]) -> list[Row]:
     ]
 
 
+def compare_views(out: Path, work: Path, threads: int) -> tuple[list[Row], Row]:
+    """Colour a run's mesh without its held-out photos and compare it with its splat at their views.
+
+    Args:
+        out: OUT of a run with a mesh.
+        work: Folder for textures and pictures.
+        threads: Photos in parallel.
+
+    Returns:
+        A row for each view and kind, and the CPU seconds that colours and textures took.
+    """
+    run = open_run_mesh(out)
+    made, seconds = colour_without(run, work, threads)
+    return draw_views(run, made, open_run(out), work), seconds
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("out", type=Path, help="OUT of a run with a mesh")
@@ -212,9 +231,7 @@ def main() -> None:
     options.add_argument("--json", type=Path)
     arguments = options.parse_args()
     try:
-        run = open_run_mesh(arguments.out)
-        made, seconds = colour_without(run, arguments.work, arguments.threads)
-        rows = draw_views(run, made, arguments.work)
+        rows, seconds = compare_views(arguments.out, arguments.work, arguments.threads)
     except SplatpipeError as error:
         options.exit(error.exit_code, f"{error.message} {error.hint}\n")
     means = mean_rows(rows)

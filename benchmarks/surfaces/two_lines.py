@@ -2,8 +2,11 @@
 
 ``two_lines --photos OUT --splat OUT --pictures FOLDER --depths FOLDER`` compares finished runs on the demo capture
 from the same cameras: ``--photos`` with surfaces from the photos' depths, ``--splat`` with those from the splat's.
-Either may be omitted. ``--poisson FOLDER`` adds a mesh by ``poisson_mesh`` of the first pipeline's cloud. Nothing is
-run: times and memory are taken from the runs' manifests, for the machine that they name.
+Either may be omitted. ``--views FOLDER`` compares the first run's textured mesh with its splat at the held-out views
+(``mesh_views``), whose pictures it writes to the folder; ``side_by_side`` draws parts of them for people.
+``--without-truth`` takes runs on any capture, and compares only stages and views. ``--poisson FOLDER`` adds a mesh by
+``poisson_mesh`` of the first pipeline's cloud. Nothing is run: times and memory are taken from the runs' manifests, for
+the machine that they name.
 
 The first table lists the stages of each pipeline, shared ones once; the second, the products' size, completeness, and
 accuracy against the truth by ``surface_truth``. The third has the figures that the paper that splatpipe follows
@@ -18,6 +21,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mesh_views import COLUMNS as VIEW_COLUMNS
+from mesh_views import compare_views, mean_rows
 from surface_products import find_products
 from surface_truth import PRODUCTS, measure
 from tables import Row, print_table
@@ -50,6 +55,7 @@ PUBLISHED = [
     {"building": number, "splat": splat, "classical": classical, "on": "RTX 3090"}
     for number, splat, classical in ((1, 28, 42), (2, 25, 47), (3, 35, 51))
 ]
+VIEW_THREADS = 2
 PUBLISHED_COLUMNS = {
     "building": "building:",
     "splat, min": "splat:",
@@ -140,6 +146,8 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--photos", type=Path, help="OUT with surfaces of the photos' depths")
     options.add_argument("--splat", type=Path, help="OUT with surfaces of the splat's depths")
+    options.add_argument("--views", type=Path, help="folder for pictures of the held-out views")
+    options.add_argument("--without-truth", action="store_true", help="the runs are not on the demo capture")
     options.add_argument("--poisson", type=Path, help="folder of a Poisson mesh of the first line's cloud")
     options.add_argument("--pictures", type=Path, help="folder of true pictures, by splatpipe.demo.truth.orthographic")
     options.add_argument("--depths", type=Path, help="folder of true depths, by splatpipe.demo.truth.depth_maps")
@@ -148,6 +156,8 @@ def main() -> None:
     lines = {"photos": arguments.photos, "splat": arguments.splat}
     stages: list[Row] = []
     products: list[Row] = []
+    views: list[Row] = []
+    seconds: Row = {}
     try:
         for line, out in lines.items():
             if out is None:
@@ -155,18 +165,25 @@ def main() -> None:
             rows = stage_rows(line, finished_stages(out, SPLAT_ONLY if line == "photos" else ()))
             known = {row["stage"] for row in stages if row["line"] == "both"}
             stages += [row for row in rows if row["stage"] not in known]
-            tables = measure(out, list(PRODUCTS), "none", arguments.pictures, arguments.depths)
-            products += product_rows(line, out, tables)
+            if not arguments.without_truth:
+                tables = measure(out, list(PRODUCTS), "none", arguments.pictures, arguments.depths)
+                products += product_rows(line, out, tables)
+        if arguments.views is not None and arguments.photos is not None:
+            views, seconds = compare_views(arguments.photos, arguments.views, VIEW_THREADS)
         if arguments.poisson is not None:
             tables = measure(arguments.poisson, ["mesh"], "none", None, arguments.depths)
             products += product_rows("Poisson", arguments.poisson, tables)
     except SplatpipeError as error:
         options.exit(error.exit_code, f"{error.message} {error.hint}\n")
     print_table("what each line takes", stages, STAGES)
-    print_table("what it gives", sorted(products, key=lambda row: str(row["product"])), FIGURES)
+    if products:
+        print_table("what it gives", sorted(products, key=lambda row: str(row["product"])), FIGURES)
+    if views:
+        print_table("at the held-out views", [*views, *mean_rows(views)], VIEW_COLUMNS)
+        print(f"CPU seconds: vertex colours {seconds['vertices']:.1f}, textures {seconds['textured']:.1f}")
     print_table("published: minutes for a building, photos to products", PUBLISHED, PUBLISHED_COLUMNS)
     if arguments.json:
-        report = {"stages": stages, "products": products, "published": PUBLISHED}
+        report = {"stages": stages, "products": products, "views": views, "published": PUBLISHED}
         arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
