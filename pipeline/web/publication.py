@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.files.durable import beside, remove_unfinished
-from splatpipe.pipeline.engine.files.json_file import write_json
+from splatpipe.pipeline.engine.files.durable import beside, remove_unfinished, write_durably
+from splatpipe.pipeline.engine.files.json_file import json_text, read_json
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.surface.levels.copc import write_copc
 from splatpipe.pipeline.surface.levels.map_tiles import write_ortho_tiles, write_relief_tiles
@@ -118,7 +118,9 @@ def _maps(products: RunProducts, folder: Path, report: Reporter) -> Facts:
 
 
 def write_viewer_surfaces(products: RunProducts, path: Path, work: Path, report: Reporter) -> list[str]:
-    """Write what the viewer shows besides the splat; nothing if the run made neither mesh nor cloud.
+    """Write what the viewer shows besides the splat, unless an earlier, killed call did.
+
+    Nothing is written if the run made neither mesh nor cloud.
 
     Args:
         products: The run's products.
@@ -133,6 +135,8 @@ def write_viewer_surfaces(products: RunProducts, path: Path, work: Path, report:
         SplatpipeError: if a product is broken.
         OSError: if the disk is full or not writable.
     """
+    if path.is_file():
+        return list(read_json(path))
     surfaces: Facts = {}
     report.progress(0, 2, "reducing the mesh and the cloud for the viewer", "products")
     if products.mesh is not None and (mesh := viewer_mesh(products.mesh, work)) is not None:
@@ -142,7 +146,7 @@ def write_viewer_surfaces(products: RunProducts, path: Path, work: Path, report:
         surfaces["points"] = points
     report.progress(2, 2, "reducing the mesh and the cloud for the viewer", "products")
     if surfaces:
-        write_json(path, surfaces)
+        write_durably(path, json_text(surfaces))
     return list(surfaces)
 
 

@@ -11,7 +11,7 @@ import pytest
 from some_splats import some_gaussians
 
 from splatpipe.pipeline.app.formats import check_possible, with_formats
-from splatpipe.pipeline.engine.errors import UsageError
+from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.splat.formats import plain_ply
 from splatpipe.pipeline.splat.formats.files import read_scene
 from splatpipe.pipeline.splat.model.scene import Scene, SceneFacts
@@ -48,6 +48,18 @@ def test_unknown_or_impossible_formats_are_reported_at_once(demo_copy: Path) -> 
     with pytest.raises(UsageError, match="No format is given"):
         with_formats(out, " , ")
     check_possible(out, "laz,tiles")
+
+
+def test_maps_of_a_finished_run_are_made_without_touching_the_rest(demo_copy: Path) -> None:
+    out = demo_copy
+    with pytest.raises(SplatpipeError, match=r"cloud\.laz") as refused:
+        check_possible(out, "copc")
+    assert "--products cloud" in refused.value.hint
+    code, output = splatpipe("export", str(out), "--format", "mbtiles")
+    assert code == 0
+    assert [stage["name"] for stage in output["stages"] if stage["state"] != "reused"] == ["publish"]
+    assert sorted(path.name for path in (out / "export").iterdir()) == ["dsm.mbtiles", "ortho.mbtiles"]
+    assert with_formats(out, "spz") == {"export": {"formats": "spz"}, "publish": {"formats": "mbtiles"}}
 
 
 def test_a_file_is_converted_and_the_result_is_reported(demo_run: Path, tmp_path: Path) -> None:

@@ -95,7 +95,9 @@ def test_the_viewer_gets_points_and_mesh_in_the_runs_frame(
     path = tmp_path / "surfaces.json"
     shown = write_viewer_surfaces(products, path, tmp_path / "work", tiny_scene.Recorder())
     assert shown == ["mesh", "points"] and not (tmp_path / "work").exists()
-    found = json.loads(path.read_text())
+    found, stamp = json.loads(path.read_text()), path.stat().st_mtime_ns
+    assert write_viewer_surfaces(products, path, tmp_path / "work", tiny_scene.Recorder()) == shown
+    assert path.stat().st_mtime_ns == stamp  # a killed run goes on behind it
     for data, least, most in ((found["points"], 400, 1000), (found["mesh"], 500, 2000)):
         places = numbers(data["xyz"], "<u2").reshape(-1, 3) * data["step"] + np.array(data["low"])
         assert least < len(places) <= most
