@@ -39,5 +39,5 @@ def _classifier(inputs: Inputs, surface: RunSurface, site: SiteExtent, cell_m: f
     if not (terrain.is_file() and cover.is_file()):
         return None
     grid = make_grid(surface.frame, site.box, cell_m)
-    rasters = (open_surface(path) for path in (inputs["dsm.files"] / "dsm.tif", terrain, cover))
-    return PointClassifier(*rasters, grid, noise_gsd(site.gsd_m, grid)).classify
+    top, ground, shown = (open_surface(path) for path in (inputs["dsm.files"] / "dsm.tif", terrain, cover))
+    return PointClassifier(top, ground, shown, grid, noise_gsd(site.gsd_m, grid)).classify

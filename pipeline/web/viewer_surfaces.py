@@ -84,7 +84,7 @@ def _factor(pixels: float) -> int:
 
 
 def _corner_places(mesh: ChartedMesh) -> Float64[np.ndarray, "k 3"]:
-    return mesh.vertices[mesh.triangles.ravel()]
+    return np.asarray(mesh.vertices[mesh.triangles.ravel()])
 
 
 def _packed(places: Float64[np.ndarray, "n 3"]) -> dict[str, Any]:

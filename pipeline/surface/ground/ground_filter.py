@@ -117,7 +117,7 @@ def _left_by_windows(over: Cells, scale: GroundScale) -> Mask:
         with np.errstate(invalid="ignore"):
             objects |= here - low > scale.noise_m + RISE * radius * scale.cell_m
         here = low
-    return ~objects
+    return np.asarray(~objects)
 
 
 def _steps(height: Cells, scale: GroundScale) -> Mask:
@@ -197,4 +197,4 @@ def _without_feet(ground: Mask, over: Cells, scale: GroundScale) -> Mask:
         return ground
     level = fill_membrane(np.where(sure, over, np.nan))
     with np.errstate(invalid="ignore"):
-        return ground & (sure | (over - level <= scale.noise_m / 2.0))
+        return np.asarray(ground & (sure | (over - level <= scale.noise_m / 2.0)))

@@ -51,7 +51,7 @@ def find_roofs(height: Cells, over: Cells, scale: RoofScale) -> Mask:
     large[0] = False
     roofs = large[parts]
     wide = cv2.dilate(roofs.astype(np.uint8), _square(scale.radius(WINDOW_M) + 1)) > 0
-    return high & _without_holes(high & _morph(wide, cv2.MORPH_CLOSE, scale.radius(GAP_M)), scale)
+    return np.asarray(high & _without_holes(high & _morph(wide, cv2.MORPH_CLOSE, scale.radius(GAP_M)), scale))
 
 
 def _without_holes(mask: Mask, scale: RoofScale) -> Mask:

@@ -86,7 +86,7 @@ def _cut(mesh: ChartedMesh, axis: int, line: float) -> ChartedMesh:
 
 def _majority(side: Int64[np.ndarray, "m 3"]) -> Int64[np.ndarray, "m 1"]:
     """The side on which two corners lie."""
-    return np.sign(side.sum(axis=1, keepdims=True))
+    return np.asarray(np.sign(side.sum(axis=1, keepdims=True)))
 
 
 def _pieces(part: ChartedMesh, through: Bool[np.ndarray, " m"], axis: int, line: float) -> list[ChartedMesh]:
@@ -110,7 +110,7 @@ def _pieces(part: ChartedMesh, through: Bool[np.ndarray, " m"], axis: int, line:
         turned = mesh.triangles[:, ends[0]] > mesh.triangles[:, ends[1]]
         p, q = mesh.corners[:, ends[0]], mesh.corners[:, ends[1]]
         p, q = np.where(turned[:, None], q, p), np.where(turned[:, None], p, q)
-        return p + share[rows, None] * (q - p)
+        return np.asarray(p + share[rows, None] * (q - p))
 
     def piece(mesh: ChartedMesh, indices: list[np.ndarray], places: list[np.ndarray]) -> ChartedMesh:
         return ChartedMesh(vertices, np.stack(indices, axis=1), np.stack(places, axis=1), mesh.charts)

@@ -194,7 +194,7 @@ def _unmultiplied(whole: Float32[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w
     """Bytes of colours that were multiplied by their alpha, 0 to 255."""
     alpha = whole[..., 3:]
     colours = np.where(alpha > 0.0, whole[..., :3] * (255.0 / np.maximum(alpha, 1e-3)), 0.0)
-    return np.rint(np.clip(np.concatenate([colours, alpha], axis=2), 0.0, 255.0)).astype(np.uint8)
+    return np.asarray(np.rint(np.clip(np.concatenate([colours, alpha], axis=2), 0.0, 255.0)).astype(np.uint8))
 
 
 Values = Callable[[np.ma.MaskedArray], Float32[np.ndarray, "h w c"]]

@@ -120,4 +120,4 @@ def pack_picture(picture: UInt8[np.ndarray, "h w 4"]) -> bytes | None:
         done, data = cv2.imencode(".png", picture[..., [2, 1, 0, 3]])
     if not done:
         raise MachineError("A map's tile could not be packed.", "Is there enough memory?")
-    return data.tobytes()
+    return bytes(data)

@@ -112,7 +112,7 @@ class _Quadrics:
     def costs(self, edges: _Edges) -> Float64[np.ndarray, " e"]:
         """What each edge's collapse misses: square metres of triangles times squared metres."""
         length = ((self._places[edges.gone] - self._places[edges.kept]) ** 2).sum(axis=1)
-        return self._missed(edges) + LENGTH_WEIGHT * length * self._weights[edges.gone]
+        return np.asarray(self._missed(edges) + LENGTH_WEIGHT * length * self._weights[edges.gone])
 
     def merge(self, edges: _Edges) -> float:
         """Carry collapses out; returns the largest distance missed, metres, as the mean over a vertex's planes."""
@@ -131,7 +131,7 @@ class _Quadrics:
 
 
 def _keys(edges: _Edges, size: int) -> Int64[np.ndarray, " e"]:
-    return edges.gone * size + edges.kept
+    return np.asarray(edges.gone * size + edges.kept)
 
 
 def _sides(mesh: ChartedMesh) -> tuple[Int64[np.ndarray, "s 2"], Int64[np.ndarray, " s"]]:
@@ -219,7 +219,7 @@ def _keeps_shape(mesh: ChartedMesh, edges: _Edges) -> Bool[np.ndarray, " e"]:
     bad = _turned(mesh.vertices[was.triangles], mesh.vertices[after], MIN_TURN)
     bad |= _area(places) * _area(was.corners) <= 0.0
     good[number[was.triangles].max(axis=1)[bad]] = False
-    return good
+    return np.asarray(good)
 
 
 def _turned(before: Float64[np.ndarray, "m 3 3"], after: Float64[np.ndarray, "m 3 3"], least: float) -> np.ndarray:

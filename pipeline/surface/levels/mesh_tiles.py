@@ -155,4 +155,4 @@ def _uri(key: TileKey) -> str:
 def _middle(mesh: ChartedMesh) -> Float64[np.ndarray, " 3"]:
     """The middle of the box of a mesh's vertices, in whole metres."""
     used = mesh.vertices[np.unique(mesh.triangles)]
-    return np.rint((used.min(axis=0) + used.max(axis=0)) / 2.0)
+    return np.asarray(np.rint((used.min(axis=0) + used.max(axis=0)) / 2.0))

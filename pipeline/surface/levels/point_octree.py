@@ -92,7 +92,7 @@ class Cube:
         return np.asarray(self._from_corner(records) * parts // self.side)
 
     def _from_corner(self, records: Records) -> Int64[np.ndarray, "n 3"]:
-        return np.stack([records[name].astype(np.int64) for name in "XYZ"], axis=1) - self.lowest
+        return np.asarray(np.stack([records[name].astype(np.int64) for name in "XYZ"], axis=1) - self.lowest)
 
 
 class Piles:

@@ -79,7 +79,7 @@ def shaded_relief(
     """
     shade = np.clip((height - low) / max(high - low, 1e-9), 0.0, 1.0)
     colours = matplotlib.colormaps["viridis"](np.nan_to_num(shade))[..., :3] * _light(height, step)[..., None]
-    return np.clip(colours * 255.0, 0.0, 255.0).astype(np.uint8)
+    return np.asarray(np.clip(colours * 255.0, 0.0, 255.0).astype(np.uint8))
 
 
 def _light(height: Float64[np.ndarray, "h w"], step: float) -> Float64[np.ndarray, "h w"]:
