@@ -19,6 +19,7 @@ from markupsafe import Markup
 
 from splatpipe.pipeline.app.page_file import one_line
 from splatpipe.pipeline.app.path_labels import PathLabels
+from splatpipe.pipeline.engine.files.output_file import write_file
 
 TEMPLATE = Path(__file__).resolve().parent / "templates" / "report.typ"
 MAX_MARKS = 14  # cuttings, the worst mark of each of the worst points
@@ -59,9 +60,9 @@ def report_pdf(content: Mapping[str, Any], places: PathLabels) -> bytes:
     with tempfile.TemporaryDirectory(prefix="splatpipe-report-") as name:
         folder = Path(name)
         values = _Files(folder, places).plain(shortened(content))
-        (folder / "report.json").write_text(json.dumps(values), encoding="utf-8")
+        write_file(folder / "report.json", json.dumps(values))
         template = folder / TEMPLATE.name
-        template.write_bytes(TEMPLATE.read_bytes())
+        write_file(template, TEMPLATE.read_bytes())
         fonts = [str(Path(get_data_path()) / "fonts" / "ttf")]
         compiler = typst.Compiler(str(template), str(folder), fonts, ignore_system_fonts=True)
         pdf = compiler.compile(format="pdf")
@@ -194,6 +195,6 @@ class _Files:
             is_picture = head.startswith("data:image/")
             ending = "svg" if not is_picture else "png" if "png" in head else "jpg"
             name = f"{len(self._names)}.{ending}"
-            (self._folder / name).write_bytes(base64.b64decode(body) if is_picture else markup.encode())
+            write_file(self._folder / name, base64.b64decode(body) if is_picture else markup)
             self._names[markup] = name
         return self._names[markup]

@@ -36,6 +36,7 @@ ALLOWED = {
     "pipeline/surface/facades/elevation_files.py": "GDAL and Pillow, in the new folder of whole_file",
     "pipeline/surface/drawings/drawing_picture.py": "matplotlib, in the new folder of whole_file",
     "pipeline/surface/rasters/geotiff.py": "GDAL, in the new folder of whole_file",
+    "pipeline/surface/levels/mbtiles.py": "SQLite, in the new folder of whole_file",
     # In a stage's working folder, which is new, or in which open_store found no link:
     "pipeline/sfm/mapping/completion.py": "COLMAP's database",
     "pipeline/sfm/matching/keypoints.py": "COLMAP's database",
@@ -49,6 +50,7 @@ ALLOWED = {
     "pipeline/sfm/matching/reduction.py": "COLMAP's database",
     "pipeline/sfm/model/view_graph.py": "COLMAP's database",
     "stages/features.py": "COLMAP's database",
+    "pipeline/surface/levels/point_octree.py": "points added to piles, in a folder that has just been made",
     "stages/clean.py": "a copy of the trained model; photos in a new temporary folder",
     "pipeline/train/blocks/assembly.py": "copies of the coarse pass's files",
     "pipeline/survey/placing/model.py": "copies of the model's files",
