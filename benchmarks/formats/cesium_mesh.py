@@ -89,11 +89,9 @@ def check_run(out: Path, modules: Path, pictures: Path | None) -> None:
     """Print the enclosed background of a run's tiles, in mixed levels and in the finest alone."""
     tiles = out / "export/mesh-tiles"
     tileset = read_json(tiles / "tileset.json")
-    origin = tileset["asset"]["extras"]["splatpipe"]["origin"]
     centre, half = box_of(tileset)
-    lies = SplatOrigin(origin["latitude"], origin["longitude"], origin["height_m"])
     with opened(tiles, modules) as (page, heard):
-        place(page, lies)
+        place(page, SplatOrigin(0.0, 0.0, 0.0))
         page.evaluate("() => { enu = Cesium.Matrix4.clone(tileset.root.transform); }")  # views are in the tiles' frame
         for number, (eye, target) in enumerate(VIEWS):
             eye_m, target_m = centre + 2.0 * half * np.array(eye), centre + 2.0 * half * np.array(target)
