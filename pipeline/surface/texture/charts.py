@@ -77,9 +77,9 @@ def make_charts(
     low, high = _boxes(part, places[seen], len(order))
     fine_m = np.bincount(part, pixel_m[seen], len(order)) / np.maximum(np.bincount(part, minlength=len(order)), 1)
     unseen = np.flatnonzero(label == NONE)
-    scale = _scales(high - low, fine_m, most_texels - len(unseen) * CELL**2)
     origin = np.floor(low)
-    size = np.ceil((high - origin) * scale[:, None]).astype(np.int32) + (1 + 2 * BORDER)
+    scale = _scales(high - origin, fine_m, most_texels - len(unseen) * CELL**2)
+    size = _sizes(high - origin, scale)
     chart, corners = np.empty(len(label), np.int32), np.empty((len(label), 3, 2), np.float32)
     chart[seen] = part
     corners[seen] = (places[seen] - origin[part][:, None]) * scale[part][:, None, None] + BORDER
@@ -140,13 +140,18 @@ def _cut(part: np.ndarray, places: Float64[np.ndarray, "s 3 2"]) -> Int64[np.nda
     return part.astype(np.int64)
 
 
+def _sizes(extent: Float64[np.ndarray, "c 2"], scale: Float64[np.ndarray, " c"]) -> Int32[np.ndarray, "c 2"]:
+    """Width and height of charts with their borders, texels."""
+    return np.asarray(np.ceil(extent * scale[:, None]).astype(np.int32) + (1 + 2 * BORDER))
+
+
 def _scales(
     extent: Float64[np.ndarray, "c 2"], pixel_m: Float64[np.ndarray, " c"], most: float
 ) -> Float64[np.ndarray, " c"]:
     """Texels per pixel of each chart such that all charts have at most so many texels."""
 
     def texels(scale: Float64[np.ndarray, " c"]) -> float:
-        return float((extent * scale[:, None] + (2 * BORDER + 1)).prod(axis=1).sum())
+        return float(_sizes(extent, scale).astype(np.float64).prod(axis=1).sum())
 
     scale = np.ones(len(pixel_m))
     if texels(scale) <= most:

@@ -61,7 +61,7 @@ def make_mesh(task: TexturedMeshTask, work: Path, out: Path, report: Reporter) -
     simplifier()
     shape = task.shape
     photos = photo_set(shape.surface.photos, shape.voxel_m, shape.threads)
-    work.mkdir(exist_ok=True)
+    work.mkdir(parents=True, exist_ok=True)
     fine, reduced = work / "fine.npz", work / "mesh.npz"
     if not fine.is_file() and not reduced.is_file():
         mesh, voxel_m = fine_mesh(shape, photos, report)

@@ -258,5 +258,5 @@ def test_the_complete_mesh_or_how_to_install_open3d(tmp_path: Path) -> None:
     make_mesh(task, tmp_path / "work", tmp_path, again)  # as after a kill while it was decimated
     assert (files / "mesh.glb").read_bytes() == made and again.steps == [(1, 1)]
     empty = replace(task, shape=replace(shape, site=replace(house_site(), reach=(500.0, 500.0, 510.0, 510.0))))
-    with pytest.raises(SplatpipeError, match="no surface"):
+    with pytest.raises(SplatpipeError, match="No surface"):
         make_mesh(empty, tmp_path / "empty", tmp_path, Recorder())
