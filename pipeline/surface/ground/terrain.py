@@ -24,6 +24,7 @@ from splatpipe.pipeline.surface.heights.surface_file import SurfaceFile
 from splatpipe.pipeline.surface.rasters.tiles import Tile
 
 MARGIN_M = 1.5 * WIDEST_M  # around a part, in which objects have to be seen whole
+SURFACE_GSD = 3.0  # from low ground up to which the surface is taken over: 97 % of heights are within
 MAX_HOLE_M2 = 400.0  # holes in the surface model up to this area are filled: a pond, a hall's roof that nothing matches
 # Expected deviation of filled ground, over the distance to the next ground that was seen: 90 % of the ground under
 # houses and crowns of the made slope is within twice that.
@@ -109,7 +110,7 @@ class TerrainSteps:
     def _ground_part(self, part: Tile) -> Arrays:
         window, side = self._grid.window(part, self._scale.cells(MARGIN_M)), self._grid.side
         low = self._low.window(window, "low")
-        near = _near_ground(low, find_ground(low, self._scale), self._scale.noise_m)
+        near = _near_ground(low, find_ground(low, self._scale), SURFACE_GSD * self._scale.gsd_m)
         lowest, highest = (unblocked(each[inner(part, window)], side) for each in near)
         heights = self._source.heights_m(self._grid.cells(part))
         ground = (heights >= lowest) & (heights <= highest)  # False for NaN

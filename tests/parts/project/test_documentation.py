@@ -39,7 +39,10 @@ QUICK = (
 )  # seconds each on a run that has hardly begun
 SOURCES = (ROOT, ROOT / "pipeline", ROOT / "pipeline/raster")  # the folders that paths in the pages are relative to
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-ENDINGS = {*"csv json tif glb obj ply webm py toml laz md mbtiles mtl jpg txt html geojson dxf".split()}
+ENDINGS = (
+    *("csv", "json", "tif", "glb", "obj", "mtl", "jpg", "ply", "webm", "py", "toml", "laz", "md", "mbtiles"),
+    *("txt", "html", "geojson", "dxf"),
+)
 
 
 def name_of(page: Path) -> str:
