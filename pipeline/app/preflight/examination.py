@@ -172,8 +172,7 @@ def _control(source: RunSource, config: LineConfig, intake: Intake) -> tuple[tup
     bars = scale_bar_findings(source.part_path("source.scale_bars"))
     if not path.is_file():
         return (), bars
-    half_pixel = 0.5 if config.georef.pixel_origin == "centre" else 0.0
-    findings, places = control_findings(path, bool(config.georef.approximate_crs), intake, half_pixel)
+    findings, places = control_findings(path, intake, config.georef)
     return tuple(places), [*findings, *bars]
 
 

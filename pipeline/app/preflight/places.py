@@ -19,7 +19,8 @@ from splatpipe.pipeline.survey.crs.coordinate_readings import nearer_reading
 from splatpipe.pipeline.survey.crs.crs import Crs, to_geodetic
 from splatpipe.pipeline.survey.files.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.files.scale_bars import read_scale_bars
-from splatpipe.pipeline.survey.points.surveyed_points import eaten_zeros, missing_photos
+from splatpipe.pipeline.survey.options import GeorefConfig
+from splatpipe.pipeline.survey.points.surveyed_points import check_names, eaten_zeros, missing_photos
 
 OUTSIDE_SHARE = 0.3  # share of marks outside their photos above which these had another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
@@ -50,27 +51,24 @@ def footprint(views: StatedPoses | None, photo: int) -> tuple[Place, ...] | None
     return tuple(corners)
 
 
-def control_findings(
-    path: Path, approximate: bool, intake: Intake, half_pixel: float
-) -> tuple[list[Finding], list[ControlPlace]]:
+def control_findings(path: Path, intake: Intake, georef: GeorefConfig) -> tuple[list[Finding], list[ControlPlace]]:
     """Read the GCP file as a run does, and compare it with the photos.
 
     Args:
         path: The file.
-        approximate: Whether a CRS whose grid is missing may be used.
         intake: The photos.
-        half_pixel: Offset from the file's pixel coordinates to those of the stored grid.
+        georef: How the file is to be read.
     """
     try:
         file = read_control_file(path)
     except SplatpipeError as error:
         return [Finding("control-broken", "error", error.message, error.hint)], []
-    findings = _mark_findings(path.name, file, intake, half_pixel)
+    findings = _mark_findings(path.name, file, intake, 0.5 if georef.pixel_origin == "centre" else 0.0)
     if not intake.positions.positions:
         return findings, []
     rows = np.array([[p.x, p.y, np.nan if p.z is None else p.z] for p in file.points], dtype=np.float64)
     try:
-        located = to_geodetic(rows, file.crs, approximate).geodetic
+        located = to_geodetic(rows, file.crs, bool(georef.approximate_crs)).geodetic
     except SplatpipeError as error:
         hint = _reading_of(rows, file.crs, intake) or error.hint
         return [*findings, Finding("control-broken", "error", error.message, hint)], []
@@ -79,10 +77,13 @@ def control_findings(
     east = np.radians(located[:, 1] - origin[1]) * np.cos(np.radians(origin[0])) * EARTH_RADIUS_M
     north = np.radians(located[:, 0] - origin[0]) * EARTH_RADIUS_M
     points = np.stack([east, north], axis=1)
+    checks = check_names(
+        [point.name for point in file.points], {p.name: p.role for p in file.points}, georef.check_points
+    )
     places = [
         ControlPlace(
             point.name,
-            "check" if point.role == "check" else "control",
+            "check" if point.name in checks else "control",
             (round(float(at[0]), 2), round(float(at[1]), 2)),
             _count_showing_photos(at, intake),
             len({mark.photo for mark in point.marks}),

@@ -108,7 +108,8 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     except OSError as error:
         raise MachineError(f"The report could not be written: {error.strerror}.") from error
     if _stamp(path) == before or (code != 0 and until_s is None):
-        raise MachineError("The report could not be written.", hint=f"{log} ends with the cause.")
+        what = "The report" if _stamp(path) == before else PDF_FILE
+        raise MachineError(f"{what} could not be written.", hint=f"{log} ends with the cause.")
     return path
 
 

@@ -277,23 +277,32 @@ def with_roles(points: Sequence[SurveyPoint], setting: str) -> list[SurveyPoint]
         SplatpipeError: if it names points that are not in the control file.
     """
     usable = [point.name for point in points if point.role != "left_out"]
-    setting = setting.strip()
-    if setting == "none":
-        checks: set[str] = set()
-    elif setting == "auto":
-        stated = [point for point in points if point.surveyed.role is not None]
-        checks = {point.name for point in stated if point.surveyed.role == "check"}
-        if not stated and len(usable) >= MIN_FOR_CHECKS:
-            checks = set(usable[EVERY_NTH - 1 :: EVERY_NTH])
-    else:
-        checks = {name.strip() for name in setting.split(",") if name.strip()}
-        unknown = sorted(checks - {point.name for point in points})
-        if unknown:
-            raise SplatpipeError(
-                f"georef.check_points has points that are not in the control file: {list_names(unknown)}.",
-                eaten_zeros(unknown, [point.name for point in points], "points")
-                or f"It has {list_names([point.name for point in points])}.",
-            )
+    checks = check_names(usable, {point.name: point.surveyed.role for point in points}, setting)
+    unknown = sorted(checks - {point.name for point in points})
+    if unknown:
+        raise SplatpipeError(
+            f"georef.check_points has points that are not in the control file: {list_names(unknown)}.",
+            eaten_zeros(unknown, [point.name for point in points], "points")
+            or f"It has {list_names([point.name for point in points])}.",
+        )
     return [
         replace(point, role="check") if point.role == "control" and point.name in checks else point for point in points
     ]
+
+
+def check_names(usable: Sequence[str], roles: Mapping[str, str | None], setting: str) -> set[str]:
+    """Names of the check points: by the option, else by the file, else every third of at least six.
+
+    Args:
+        usable: The points that can be one, in the file's order.
+        roles: What the file states of each point's role; None for nothing.
+        setting: `georef.check_points`.
+    """
+    setting = setting.strip()
+    if setting == "none":
+        return set()
+    if setting != "auto":
+        return {name.strip() for name in setting.split(",") if name.strip()}
+    if any(role is not None for role in roles.values()):
+        return {name for name, role in roles.items() if role == "check"}
+    return set(usable[EVERY_NTH - 1 :: EVERY_NTH]) if len(usable) >= MIN_FOR_CHECKS else set()

@@ -239,7 +239,12 @@ def test_findings_are_printed_even_if_the_page_cannot_be_written(tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("north_m", "severities"),
-    [((0.0, 5.0, -5.0), []), ((0.0, 5.0, 900.0), ["warning"]), ((20e3, 20.1e3, 20.2e3), ["error"])],
+    [
+        ((0.0, 5.0, -5.0), []),
+        ((0.0, 5.0, 900.0), ["warning"]),
+        ((20e3, 20.1e3, 20.2e3), ["error"]),
+        ((0.0, 1.0, 2.0, 3.0, 4.0, 5.0), []),
+    ],
 )
 def test_points_that_no_photo_can_show_are_reported(
     tmp_path: Path, north_m: tuple[float, ...], severities: list[str]
@@ -252,9 +257,10 @@ def test_points_that_no_photo_can_show_are_reported(
     latitude, longitude = np.mean([(each.latitude, each.longitude) for each in stated], axis=0)
     rows = [f"P{k},{latitude + step / 111_195.0:.8f},{longitude:.8f}" for k, step in enumerate(north_m)]
     (tmp_path / "points.csv").write_text("\n".join(["name,lat,lon", *rows]))
-    findings, places = control_findings(tmp_path / "points.csv", False, intake, 0.0)
+    findings, places = control_findings(tmp_path / "points.csv", intake, config.georef)
     assert [(finding.code, finding.severity) for finding in findings] == [("control-outside", s) for s in severities]
-    assert len(places) == 3 and ("P2" in findings[0].message if severities == ["warning"] else True)
+    assert "P2" in findings[0].message if severities == ["warning"] else True
+    assert [place.name for place in places if place.kind == "check"] == (["P2", "P5"] if len(north_m) == 6 else [])
 
 
 def test_accurate_positions_straight_down_are_told_what_control_would_buy(tmp_path: Path) -> None:
