@@ -21,7 +21,8 @@ QUICK = (
     "ortho.gsd_m=0.3",
 )
 STAGES = [stage.name for stage in LINE]
-SURFACES = ["dsm", "ortho"]  # surface stages that QUICK makes: what is turned off reads nothing, and is not made again
+# Stages that QUICK runs for surfaces: what is turned off reads nothing, and is not made again.
+SURFACES = ["dsm", "dtm", "ortho", "publish"]
 
 
 def sets(*assignments: str) -> list[str]:

@@ -182,7 +182,8 @@ def _between_rows(values: Cells, side: int) -> Float64[np.ndarray, "r w"]:
     off = (np.arange(side) + 0.5) / side - 0.5  # of a cell from its block's middle, blocks
     share = np.abs(off)[:, None]
     beside = np.where(off[:, None] < 0.0, values[:-2, None], values[2:, None])
-    return np.asarray((values[1:-1, None] * (1.0 - share) + beside * share).reshape(-1, values.shape[1]))
+    between: Cells = values[1:-1, None] * (1.0 - share) + beside * share
+    return between.reshape(-1, values.shape[1])
 
 
 def _distance(known: Mask) -> Cells:
