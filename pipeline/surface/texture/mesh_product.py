@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.splat.containers.archives import open_archive
@@ -71,6 +72,7 @@ def make_mesh(task: TexturedMeshTask, work: Path, out: Path, report: Reporter) -
         mesh, voxel_m = _load_mesh(fine)
         report.progress(0, 1, "decimating the mesh", "meshes")
         mesh = _decimate(mesh, shape.most_triangles, voxel_m)
+        return_free_heap()
         colours = vertex_colours(photos, mesh, shape.threads)
         arrays = {"vertices": mesh.vertices, "triangles": mesh.triangles, "colours": colours}
         save_arrays(reduced, **arrays, voxel_m=np.array(voxel_m))
