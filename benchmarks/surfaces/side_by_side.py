@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 COLUMNS = {"photo": "photo", "splat": "splat", "textured": "mesh, photos on it", "vertices": "mesh, vertex colours"}
-WIDTH, GAP, HEAD = 420, 6, 24  # pixels: width of a part, space around it, height of a title
+WIDTH, GAP, HEAD = 300, 6, 24  # pixels: width of a part, space around it, height of a title
 PART = re.compile(r"(?P<title>[^=]+)=(?P<view>[^:]+):(?P<box>\d+,\d+,\d+,\d+)")
 TEXT, PAPER = (20, 20, 20), (255, 255, 255)
 

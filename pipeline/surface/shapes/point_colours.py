@@ -40,6 +40,11 @@ def photo_set(sources: Sequence[PhotoSource], cell_m: float, threads: int) -> Ph
     return replace(photos, levels=exposure_levels(sources, every, 2.0 * cell_m, threads))
 
 
+def without_depths(photos: PhotoSet) -> PhotoSet:
+    """The same photos with none of their depths in memory."""
+    return replace(photos, depths=LruCache(CACHE_BYTES))
+
+
 def _sample_positions(found: PosedDepthMap, most: int) -> Float64[np.ndarray, "n 3"]:
     """Evenly sampled points of a photo's depths."""
     height, width = found.depth.shape

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.splat.containers.archives import open_archive
 from splatpipe.pipeline.surface.shapes.decimation import decimate, simplifier, split_long_edges
-from splatpipe.pipeline.surface.shapes.point_colours import photo_set
+from splatpipe.pipeline.surface.shapes.point_colours import photo_set, without_depths
 from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, fine_mesh, vertex_colours
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, in_order
 from splatpipe.pipeline.surface.shapes.tsdf import open3d
@@ -67,9 +68,11 @@ def make_mesh(task: TexturedMeshTask, work: Path, out: Path, report: Reporter) -
         mesh, voxel_m = fine_mesh(shape, photos, report)
         save_arrays(fine, vertices=mesh.vertices, triangles=mesh.triangles, voxel_m=np.array(voxel_m))
     if not reduced.is_file():
+        photos = without_depths(photos)  # reducing takes a gigabyte
         mesh, voxel_m = _load_mesh(fine)
         report.progress(0, 1, "decimating the mesh", "meshes")
         mesh = _decimate(mesh, shape.most_triangles, voxel_m)
+        return_free_heap()
         colours = vertex_colours(photos, mesh, shape.threads)
         arrays = {"vertices": mesh.vertices, "triangles": mesh.triangles, "colours": colours}
         save_arrays(reduced, **arrays, voxel_m=np.array(voxel_m))

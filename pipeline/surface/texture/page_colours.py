@@ -25,6 +25,7 @@ from splatpipe.pipeline.surface.texture.textured_mesh import Atlas
 
 Page = UInt8[np.ndarray, "h w 3"]
 AT_ONCE = 1 << 19  # texels of a task
+MIXED_AT_ONCE = 1 << 22  # texels of the charts that are mixed at a time: some 0.2 GB
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,12 +140,28 @@ def _draw_cells(task: TextureInput, number: int, page: Page) -> None:
 
 
 def _mix_seams(task: TextureInput, number: int, page: Page, threads: int) -> None:
-    """Mix the photos at seams into a page."""
-    inside = task.atlas.page()[task.blends.face] == number
-    blends = task.blends.select(inside)
+    """Mix the photos at seams into a page, a few charts at a time."""
+    blends = task.blends.select(task.atlas.page()[task.blends.face] == number)
+    chart = task.atlas.chart[blends.face]
+    order = np.argsort(chart, kind="stable")
+    texels = task.atlas.rects[:, 3:].astype(np.int64).prod(axis=1)
+    texels[task.atlas.rects[:, 0] != number] = 0
+    group = (np.cumsum(texels) // MIXED_AT_ONCE)[chart[order]]
+    for rows in np.split(order, np.flatnonzero(np.diff(group)) + 1):
+        if rows.size:
+            _mix_charts(task, blends.select(np.sort(rows)), page, threads)
+
+
+def _mix_charts(task: TextureInput, blends: Blends, page: Page, threads: int) -> None:
+    """Mix photos into the triangles of some charts.
+
+    Args:
+        task: The mesh, its charts and photos.
+        blends: What is mixed into them.
+        page: The page, with the charts' own photos in place.
+        threads: Photos in parallel.
+    """
     faces, starts, counts = np.unique(blends.face, return_index=True, return_counts=True)
-    if not faces.size:
-        return
     height, width = page.shape[:2]
     texels = texels_of(task.atlas.corners[faces].astype(np.float64), width, height)
     texels = _inside_charts(task.atlas, faces, texels, width)

@@ -11,6 +11,7 @@ from jaxtyping import Int16
 from PIL import Image
 
 from splatpipe.pipeline.engine.files.durable import write_durably
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.mvs.array_file import save_arrays
 from splatpipe.pipeline.splat.containers.archives import open_archive
@@ -92,6 +93,8 @@ def _choose(
         views = rate_faces(photos, sample_faces(mesh), task.cell_m, task.threads, report)
         label = choose_photos(views, beyond, mesh.areas(), LEAST_CELLS * task.cell_m**2)
         save_arrays(kept, label=label, listed=views.photo)
+        del views
+        return_free_heap()  # half a gigabyte, before pages are drawn
     with open_archive(kept) as arrays:
         return arrays["label"], arrays["listed"]
 
