@@ -18,9 +18,9 @@ class DsmConfig(StageConfig):
 class DtmConfig(StageConfig):
     enabled: bool = True
     """Make the terrain model (DTM), without buildings and trees: dtm.tif, its confidence, heights over the ground
-    (chm.tif); requires the surface model."""
+    (chm.tif), contours; requires the surface model."""
     contours: Literal["dtm", "dsm"] = "dtm"
-    """Draw contours of the ground (`dtm`), or of the topmost surface (`dsm`), as without a terrain model."""
+    """Draw contours of the ground (`dtm`), or of the topmost surface (`dsm`)."""
 
 
 class OrthoConfig(StageConfig):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from splatpipe.pipeline.app.library.requests import check_machine
 from splatpipe.pipeline.app.library.trained_scene import in_model_frame, in_world_frame, scene_parts
 from splatpipe.pipeline.app.library.user_errors import user_errors
+from splatpipe.pipeline.app.report import PDF_FILE, REPORT_FILE
 from splatpipe.pipeline.engine.errors import UsageError
 from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.files.output_file import require_replaceable, write_file
@@ -28,7 +29,7 @@ from splatpipe.stages.line import EXPORT, GEOREF, LINE, UNDISTORT
 if TYPE_CHECKING:
     from splatpipe.pipeline.film.filming import TrainedScene
 
-METRICS, GEOREFERENCE, REPORTS = "metrics.json", "georef.json", ("report.html", "report.pdf")
+METRICS, GEOREFERENCE = "metrics.json", "georef.json"
 Vector = Sequence[float] | NDArray[Any]
 What = Literal["colour", "depth", "normals"]
 
@@ -147,7 +148,7 @@ class Run:
     @property
     def products(self) -> dict[str, Path]:
         """The files for people in OUT, by their names there, e.g. ``splat.ply`` and ``report.html``."""
-        names = [*self._folder.deliverables(), *REPORTS]
+        names = [*self._folder.deliverables(), REPORT_FILE, PDF_FILE]
         return {name: self.out / name for name in names if (self.out / name).is_file()}
 
     def render(self, camera: Camera, what: What = "colour") -> Render:

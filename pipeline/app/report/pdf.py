@@ -11,7 +11,7 @@ import math
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +180,7 @@ class _Files:
             text = one_line(self._places.plain(value))
             return text if len(text) <= LETTERS else f"{text[:LETTERS]} …"
         if is_dataclass(value) and not isinstance(value, type):
-            return self.plain({key: getattr(value, key) for key in asdict(value)})
+            return self.plain({field.name: getattr(value, field.name) for field in fields(value)})
         if isinstance(value, Mapping):
             return {str(key): self.plain(each) for key, each in value.items()}
         if isinstance(value, Sequence):

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
+from splatpipe.pipeline.app.report import PDF_FILE, REPORT_FILE
 from splatpipe.pipeline.app.view.files import FileNotServedError, is_inside, open_inside
 from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.files.json_file import parse_json
@@ -14,12 +15,11 @@ from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, RunFolder
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE
 
-REPORT, REPORT_PDF = "report.html", "report.pdf"  # the only files for people in OUT that no stage delivers
 VIEWER = "viewer.html"
 MAX_METRICS_BYTES = 4 << 20  # half a kilobyte for each of 8,000 views; parsed for each request, while others wait
 WHAT = {
-    REPORT: "what was done, and the quality of the result",
-    REPORT_PDF: "the same in short, for the client",
+    REPORT_FILE: "what was done, and the quality of the result",
+    PDF_FILE: "the same in short, for the client",
     VIEWER: "the splat in 3D, in a single page",
     SITE_PAGE: "the splat in 3D, with levels of detail: put the folder web/ on any web host",
     "splat.ply": "the splat, for any viewer of Gaussian splats",
@@ -36,7 +36,7 @@ BROWSER_SUFFIXES = (".html", ".json", ".pdf", ".mp4", ".webm", ".png", ".jpg")
 
 def downloadable_files(run: RunFolder) -> tuple[str, ...]:
     """The files that may be fetched, relative to OUT: the report and the stages' deliverables."""
-    return tuple(name for name in (REPORT, REPORT_PDF, *run.deliverables()) if is_inside(run.out, name))
+    return tuple(name for name in (REPORT_FILE, PDF_FILE, *run.deliverables()) if is_inside(run.out, name))
 
 
 def landing(run: RunFolder, marking: bool) -> dict[str, Any]:
@@ -87,8 +87,8 @@ def _ways(names: Sequence[str], at_work: bool, marking: bool, has_log: bool) -> 
         ways.append((VIEWER, True, "3D viewer", "Fly around, measure, read coordinates"))
     if SITE_PAGE in names:
         ways.append((SITE_PAGE, True, "Viewer for the web", "For any web host: coarse at first, finer where you look"))
-    if REPORT in names:
-        ways.append((REPORT, True, "Report", "The capture, the processing and the quality of the result"))
+    if REPORT_FILE in names:
+        ways.append((REPORT_FILE, True, "Report", "The capture, the processing and the quality of the result"))
     if "flythrough.webm" in names:
         ways.append(("flythrough.webm", True, "Film", "A flight through the scene"))
     if not at_work and has_log:

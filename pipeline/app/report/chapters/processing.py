@@ -23,7 +23,7 @@ WHAT = {
     "dtm.tif": "the terrain model: heights of the ground, also under buildings and trees, a GeoTIFF",
     "dtm_confidence.tif": "how far the nearest ground is that photos see, and the expected deviation in millimetres",
     "chm.tif": "heights over the ground: the surface model less the terrain model, a GeoTIFF",
-    "contours.dxf": "contours of the ground, or of the surface model without it, for CAD",
+    "contours.dxf": "contours of the ground, or on request of the surface model, for CAD",
     "contours.geojson": "the same contours, for maps",
     "georef.json": "georeference of the splat: CRS, datum, matrices",
     "cameras.json": "the cameras in the splat's frame",
