@@ -31,7 +31,7 @@ from splatpipe.pipeline.app.node.assets.layout import (
     is_safe,
 )
 from splatpipe.pipeline.app.node.assets.outputs import chosen
-from splatpipe.pipeline.app.node.assets.rasters import UnusableRaster, check_raster, write_picture
+from splatpipe.pipeline.app.node.assets.rasters import UnplacedRaster, UnusableRaster, check_raster, write_picture
 from splatpipe.pipeline.app.node.assets.shots import Flight, cameras_json, read_flight, shots_geojson
 from splatpipe.pipeline.app.node.assets.statistics import run_statistics
 from splatpipe.pipeline.engine.files.json_file import json_text
@@ -94,7 +94,7 @@ class _Collector:
     def __init__(self, run: FinishedRun, work: Path, outputs: Sequence[str]) -> None:
         self.run, self.work, self.contents = run, work, Contents()
         self._outputs = outputs
-        self._packed: set[str] = set()  # paths in OUT
+        self._packed: set[str] = set()  # paths in OUT that are dealt with
 
     def add_place(self, place: Place) -> None:
         """Add a product that is packed as it is, after a look at it if it is a map."""
@@ -102,8 +102,7 @@ class _Collector:
             found = [name for name in self.run.files if name.startswith(place.source)]
         else:
             found = [name for name in (place.source,) if name in self.run.files]
-        if place.raster and found and (reason := self._unusable(place)):
-            self._lacks(place.entry, place.what, f"{reason}; it is there as {place.source}")
+        if place.raster and found and self._is_left_out(place):
             return
         for name in found:
             self._add_file(place.entry + name[len(place.source) :], name)
@@ -189,13 +188,19 @@ class _Collector:
         model = self.run.inputs.part("georef.model")
         return None if model is None or self.run.inputs.part("georef.frame") is None else read_flight(model)
 
-    def _unusable(self, place: Place) -> str:
-        """Why WebODM could not open a map; empty if it could."""
+    def _is_left_out(self, place: Place) -> bool:
+        """Whether WebODM could not open a map; one that is whole is packed under its own name."""
         try:
             check_raster(self.run.files[place.source], colours=place is ORTHO_PLACE)
+        except UnplacedRaster as error:
+            self._add_file(place.source, place.source)
+            self._lacks(place.entry, place.what, f"{error}; it is there as {place.source}")
+            return True
         except UnusableRaster as error:
-            return str(error)
-        return ""
+            self._packed.add(place.source)
+            self._lacks(place.entry, place.what, str(error))
+            return True
+        return False
 
     def _is_wanted(self, entry: str) -> bool:
         return bool(chosen([entry], self._outputs))

@@ -41,8 +41,9 @@ class FinishedRun:
             return "it could not be written"
         if not self._asked_for(place):
             return NOT_ASKED_FOR
-        if (self.inputs.out / place.source).exists():
-            return "the one in OUT is of an earlier run"
+        path = self.inputs.out / place.source.rstrip("/")
+        if path.is_symlink() or path.exists():
+            return f"the one in OUT is {'a link' if path.is_symlink() else 'of an earlier run'}"
         if history is not None and history.state == "failed":
             return f"its stage {place.stage} failed: {history.message or 'see the log'}"
         if place.stage not in self.inputs.artifacts:

@@ -26,6 +26,10 @@ class UnusableRaster(Exception):
     """A raster that clients could not open; its text is the reason."""
 
 
+class UnplacedRaster(UnusableRaster):
+    """A raster that is whole, but has no place on the earth."""
+
+
 def check_raster(path: Path, *, colours: bool) -> None:
     """Open a map and read of it what viewers read first: its place on the earth, corners, and overviews.
 
@@ -34,19 +38,20 @@ def check_raster(path: Path, *, colours: bool) -> None:
         colours: Whether it must be an orthophoto: 8 bits, RGBA.
 
     Raises:
-        UnusableRaster: if it cannot be read, has no place on the earth, no alpha band, or not the layout of a COG.
+        UnplacedRaster: if it has no place on the earth.
+        UnusableRaster: if it cannot be read, has no alpha band, or not the layout of a COG.
     """
     try:
         with gdal(path.parent), open_raster(path) as raster:
             if colours and (raster.colorinterp != RGBA or set(raster.dtypes) != {"uint8"}):
                 raise UnusableRaster("it is not RGBA of 8 bits")
-            if raster.crs is None or not _is_on_earth(raster):
-                raise UnusableRaster("it has no place on the earth")
             if raster.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") != "COG":
                 raise UnusableRaster("it is not a Cloud Optimised GeoTIFF")
             for row, column in ((0, 0), (raster.height // 2, raster.width // 2), (raster.height - 1, raster.width - 1)):
                 raster.read(window=Window(column, row, 1, 1))
             raster.read(out_shape=(raster.count, *reduced_shape(raster, PROBE_SIDE**2)))
+            if raster.crs is None or not _is_on_earth(raster):
+                raise UnplacedRaster("it has no place on the earth")
     except GDAL_ERRORS as error:
         raise UnusableRaster(f"it cannot be read: {error}") from error
 
