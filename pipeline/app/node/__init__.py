@@ -1,1 +1,1 @@
-"""A node: jobs of photos over HTTP, as clients of NodeODM send them."""
+"""``splatpipe node``: takes captures over HTTP as NodeODM does, runs them one after the other, and returns results."""

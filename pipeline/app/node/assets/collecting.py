@@ -94,7 +94,8 @@ class _Collector:
     def __init__(self, run: FinishedRun, work: Path, outputs: Sequence[str]) -> None:
         self.run, self.work, self.contents = run, work, Contents()
         self._outputs = outputs
-        self._packed: set[str] = set()  # paths in OUT that are dealt with
+        self._packed: set[str] = set()  # paths in OUT that have a place
+        self._broken: set[str] = set()
 
     def add_place(self, place: Place) -> None:
         """Add a product that is packed as it is, after a look at it if it is a map."""
@@ -112,8 +113,12 @@ class _Collector:
     def add_others(self) -> None:
         """Add all other deliverables, each under its own path."""
         for name in self.run.files:
+            if name in self._broken:
+                continue
             if name not in self._packed and not name.startswith(REPLACED):
                 self._add_file(name, name)
+            elif self._outputs and name not in self.contents.entries:
+                self._add_file(name, name)  # if outputs names it as it is in OUT
 
     def add_picture(self) -> None:
         """Add the orthophoto as PNG."""
@@ -197,7 +202,7 @@ class _Collector:
             self._lacks(place.entry, place.what, f"{error}; it is there as {place.source}")
             return True
         except UnusableRaster as error:
-            self._packed.add(place.source)
+            self._broken.add(place.source)
             self._lacks(place.entry, place.what, str(error))
             return True
         return False

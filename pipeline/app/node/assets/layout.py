@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+ALL = "all.zip"
 MAX_PATH_LETTERS = 1024
 MAX_PATH_DEPTH = 32
 

@@ -59,7 +59,7 @@ def pack_run(out: Path, target: Path, outputs: Sequence[str] = (), log: Path | N
     labels = PathLabels.of(run.inputs.out, run.inputs.photos_dir)
     with whole_file(target) as aside:
         contents = collect(run, aside.parent, outputs)
-        lines = tuple(labels.plain(line) for line in _lines(contents, outputs))
+        lines = tuple(" ".join(labels.plain(line).split()) for line in _lines(contents, outputs))
         entries = [contents.entries[name] for name in chosen(contents.entries, outputs)]
         if not outputs or LOG in chosen([LOG], outputs) or _top_level(entries) < 2:  # WebODM unwraps a lone folder
             entries.append(Entry(LOG, _log(log, lines)))

@@ -6,16 +6,15 @@ compressed data as it is (PKWARE's APPNOTE 6.3.10, sections 4.3 to 4.5). Light t
 
 from __future__ import annotations
 
+import os
 import struct
 import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatpipe.pipeline.app.node.assets.layout import FOLDERS, MEDIA_TYPES, SINGLE
+from splatpipe.pipeline.app.node.assets.layout import ALL, FOLDERS, MEDIA_TYPES, SINGLE
+from splatpipe.pipeline.app.serving.files import FileNotServedError, OpenFile, open_inside
 
-ALL = "all.zip"
-CHUNK_BYTES = 1 << 18
 MOST_16, MOST_32 = (1 << 16) - 1, (1 << 32) - 1  # in a field, they mean that the number is in one of 64 bits
 LONG_FROM = MOST_32  # the least number that needs a field of 64 bits
 LOCAL = struct.Struct("<4s5H3L2H")
@@ -33,103 +32,100 @@ Segment = bytes | tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Asset:
-    """A file that a client can download.
+class OpenAsset(OpenFile):
+    """A part of an open `all.zip`, to be sent like a file.
 
     Attributes:
-        name: Its name.
-        source: The `all.zip` that it is taken from.
         segments: What it consists of, in order.
     """
 
-    name: str
-    source: Path
     segments: tuple[Segment, ...]
 
-    @property
-    def size(self) -> int:
-        """Its bytes."""
-        return sum(_length(segment) for segment in self.segments)
-
-    @property
-    def media_type(self) -> str:
-        """Its media type."""
-        return MEDIA_TYPES.get(f".{self.name.rpartition('.')[2]}", "application/octet-stream")
-
-    def chunks(self, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
-        """Its bytes from ``start`` to before ``stop``, a quarter of a megabyte at a time at most.
-
-        Raises:
-            OSError: if `all.zip` cannot be read, or ends too early.
-        """
-        stop = self.size if stop is None else min(stop, self.size)
-        with self.source.open("rb") as file:
-            at = 0
-            for segment in self.segments:
-                first, last = max(start - at, 0), min(stop - at, _length(segment))
-                at += _length(segment)
-                if first >= last:
-                    continue
+    def read(self, length: int, at: int) -> bytes:
+        """Bytes from an offset on, at most so many; none at the end only, or where `all.zip` ends too early."""
+        for segment in self.segments:
+            size = _length(segment)
+            if at < size:
                 if isinstance(segment, bytes):
-                    yield segment[first:last]
-                    continue
-                file.seek(segment[0] + first)
-                left = last - first
-                while left:
-                    chunk = file.read(min(left, CHUNK_BYTES))
-                    if not chunk:
-                        raise OSError(f"{self.source.name} ends too early")
-                    left -= len(chunk)
-                    yield chunk
+                    return segment[at : at + length]
+                return os.pread(self.descriptor, min(length, size - at), segment[0] + at)
+            at -= size
+        return b""
 
 
 def _length(segment: Segment) -> int:
     return len(segment) if isinstance(segment, bytes) else segment[1]
 
 
-def open_asset(path: Path, name: str) -> Asset | None:
-    """Open a download of a finished task.
+def is_asset(name: str) -> bool:
+    """Whether there can be a download of this name."""
+    return name == ALL or name in SINGLE or name in FOLDERS
+
+
+def media_type(name: str) -> str:
+    """The media type of a download."""
+    return MEDIA_TYPES.get(f".{name.rpartition('.')[2]}", "application/octet-stream")
+
+
+def open_asset(folder: Path, name: str) -> OpenFile:
+    """Open a download of a finished task; whoever sends it closes its descriptor.
 
     Args:
-        path: Its `all.zip`.
-        name: ``all.zip``, or a name of ``SINGLE`` or ``FOLDERS``; any other is not there.
-
-    Returns:
-        The download; None if there is no such one.
+        folder: The folder with `all.zip`.
+        name: ``all.zip``, or a name of ``SINGLE`` or ``FOLDERS``.
 
     Raises:
-        OSError: if `all.zip` cannot be read.
-        zipfile.BadZipFile: if it is broken.
+        FileNotServedError: if there is no such download.
     """
+    if not is_asset(name):
+        raise FileNotServedError
+    whole = open_inside(folder, ALL)
     if name == ALL:
-        return Asset(name, path, ((0, path.stat().st_size),))
-    if name not in SINGLE and name not in FOLDERS:
-        return None
-    with zipfile.ZipFile(path) as archive:
-        return _asset(archive, path, name)
+        return whole
+    try:
+        with _directory(whole) as archive:
+            segments = _segments(archive, name)
+    except (zipfile.BadZipFile, OSError) as error:
+        os.close(whole.descriptor)
+        raise FileNotServedError from error
+    if segments is None:
+        os.close(whole.descriptor)
+        raise FileNotServedError
+    tag = f'{whole.tag[:-1]}-{name}"'
+    return OpenAsset(whole.descriptor, sum(map(_length, segments)), tag, segments)
 
 
-def list_assets(path: Path) -> dict[str, int]:
+def list_assets(folder: Path) -> dict[str, int]:
     """The names of all downloads of a finished task, and their bytes.
 
     Raises:
-        OSError: if `all.zip` cannot be read.
+        FileNotServedError: if there is no `all.zip`.
         zipfile.BadZipFile: if it is broken.
     """
-    with zipfile.ZipFile(path) as archive:
-        found = [_asset(archive, path, name) for name in (*SINGLE, *FOLDERS)]
-    return {ALL: path.stat().st_size, **{asset.name: asset.size for asset in found if asset is not None}}
+    whole = open_inside(folder, ALL)
+    try:
+        with _directory(whole) as archive:
+            found = {name: _segments(archive, name) for name in (*SINGLE, *FOLDERS)}
+    finally:
+        os.close(whole.descriptor)
+    sizes = {name: sum(map(_length, segments)) for name, segments in found.items() if segments is not None}
+    return {ALL: whole.size, **sizes}
 
 
-def _asset(archive: zipfile.ZipFile, path: Path, name: str) -> Asset | None:
-    infos = {info.filename: info for info in archive.infolist()}
+def _directory(whole: OpenFile) -> zipfile.ZipFile:
+    """The archive's directory; closing it leaves the descriptor open."""
+    return zipfile.ZipFile(os.fdopen(whole.descriptor, "rb", closefd=False))
+
+
+def _segments(archive: zipfile.ZipFile, name: str) -> tuple[Segment, ...] | None:
+    """What a download consists of; None if it was not made."""
     if name in SINGLE:
-        info = infos.get(SINGLE[name])
+        info = archive.NameToInfo.get(SINGLE[name])
         if info is None or info.compress_type != zipfile.ZIP_STORED:
             return None
-        return Asset(name, path, ((_data_offset(archive, info), info.file_size),))
-    below = [info for entry, info in infos.items() if entry.startswith(FOLDERS[name])]
-    return Asset(name, path, _folder(archive, below, len(FOLDERS[name]))) if below else None
+        return ((_data_offset(archive, info), info.file_size),)
+    below = [info for info in archive.infolist() if info.filename.startswith(FOLDERS[name])]
+    return _folder(archive, below, len(FOLDERS[name])) if below else None
 
 
 def _data_offset(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:

@@ -11,7 +11,8 @@ from splatpipe.pipeline.app.node.assets import archive, single
 from splatpipe.pipeline.app.node.assets.archive import Entry, write_archive
 from splatpipe.pipeline.app.node.assets.layout import FOLDERS, PLACES, SINGLE, is_safe
 from splatpipe.pipeline.app.node.assets.outputs import chosen, parse_outputs, unmatched
-from splatpipe.pipeline.app.node.assets.single import Asset, list_assets, open_asset
+from splatpipe.pipeline.app.node.assets.single import list_assets, media_type, open_asset
+from splatpipe.pipeline.app.serving.files import FileNotServedError, OpenFile
 from splatpipe.pipeline.engine.errors import UsageError
 
 TEXT = b"v 1 2 3\n" * 1000
@@ -29,11 +30,23 @@ def entries(folder: Path) -> list[Entry]:
     ]
 
 
-def all_of(asset: Asset | None) -> bytes:
-    assert asset is not None
-    data = b"".join(asset.chunks())
-    assert len(data) == asset.size
+def sent(file: OpenFile, start: int = 0, stop: int | None = None) -> bytes:
+    """Read a range as an answer does, in steps."""
+    stop, data = file.size if stop is None else min(stop, file.size), b""
+    while start + len(data) < stop:
+        chunk = file.read(min(1000, stop - start - len(data)), start + len(data))
+        assert chunk, "it ends too early"
+        data += chunk
     return data
+
+
+def all_of(folder: Path, name: str) -> bytes:
+    """Read a whole download, and close it."""
+    file = open_asset(folder, name)
+    try:
+        return sent(file)
+    finally:
+        os.close(file.descriptor)
 
 
 def test_the_same_contents_give_the_same_bytes(tmp_path: Path) -> None:
@@ -56,7 +69,7 @@ def test_large_entries_have_fields_of_64_bits(tmp_path: Path, monkeypatch: pytes
     write_archive(tmp_path / "all.zip", entries(tmp_path))
     with zipfile.ZipFile(tmp_path / "all.zip") as made:
         assert made.testzip() is None and made.read("odm_dem/dsm.tif") == RASTER
-    assert all_of(open_asset(tmp_path / "all.zip", "dsm.tif")) == RASTER
+    assert all_of(tmp_path, "dsm.tif") == RASTER
 
 
 @pytest.mark.parametrize(
@@ -80,11 +93,13 @@ def test_all_our_own_paths_are_safe() -> None:
 
 def test_a_single_file_is_a_range(tmp_path: Path) -> None:
     write_archive(tmp_path / "all.zip", entries(tmp_path))
-    asset = open_asset(tmp_path / "all.zip", "dsm.tif")
-    assert all_of(asset) == RASTER and asset is not None and asset.media_type == "image/tiff"
+    file = open_asset(tmp_path, "dsm.tif")
+    assert file.size == len(RASTER) and media_type("dsm.tif") == "image/tiff"
     for start, stop in ((0, 1), (5, 5), (100, 9000), (len(RASTER) - 1, None), (0, 1 << 40)):
-        assert b"".join(asset.chunks(start, stop)) == RASTER[start:stop]
-    assert all_of(open_asset(tmp_path / "all.zip", "all.zip")) == (tmp_path / "all.zip").read_bytes()
+        assert sent(file, start, stop) == RASTER[start:stop]
+    assert file.read(10, len(RASTER)) == b""
+    os.close(file.descriptor)
+    assert all_of(tmp_path, "all.zip") == (tmp_path / "all.zip").read_bytes()
 
 
 @pytest.mark.parametrize("limit", [None, 5000, 0])
@@ -93,10 +108,10 @@ def test_a_folder_is_an_archive_of_its_own(tmp_path: Path, monkeypatch: pytest.M
     write_archive(tmp_path / "all.zip", entries(tmp_path))
     if limit is not None:
         monkeypatch.setattr(single, "LONG_FROM", limit)
-    asset = open_asset(tmp_path / "all.zip", "textured_model.zip")
-    data = all_of(asset)
-    assert asset is not None
-    assert b"".join(asset.chunks(40, 400)) == data[40:400]
+    file = open_asset(tmp_path, "textured_model.zip")
+    data = sent(file)
+    assert sent(file, 40, 400) == data[40:400] and len(data) == file.size
+    os.close(file.descriptor)
     with zipfile.ZipFile(io.BytesIO(data)) as made:
         assert made.testzip() is None
         assert {name: made.read(name) for name in made.namelist()} == {
@@ -108,19 +123,27 @@ def test_a_folder_is_an_archive_of_its_own(tmp_path: Path, monkeypatch: pytest.M
 def test_only_known_names_are_downloads(tmp_path: Path) -> None:
     write_archive(tmp_path / "all.zip", entries(tmp_path))
     for name in ("dtm.tif", "../all.zip", "odm_dem/dsm.tif", "", "contours.geojson", "3d_tiles_model.zip"):
-        assert open_asset(tmp_path / "all.zip", name) is None
-    assert list(list_assets(tmp_path / "all.zip")) == ["all.zip", "dsm.tif", "stats.json", "textured_model.zip"]
+        with pytest.raises(FileNotServedError):
+            open_asset(tmp_path, name)
+    assert list(list_assets(tmp_path)) == ["all.zip", "dsm.tif", "stats.json", "textured_model.zip"]
 
 
-def test_a_file_that_was_cut_off_is_an_error(tmp_path: Path) -> None:
+def test_a_broken_archive_has_no_downloads(tmp_path: Path) -> None:
     write_archive(tmp_path / "all.zip", entries(tmp_path))
-    asset = open_asset(tmp_path / "all.zip", "dsm.tif")
-    assert asset is not None
+    file = open_asset(tmp_path, "dsm.tif")
     os.truncate(tmp_path / "all.zip", 2000)
-    with pytest.raises(OSError, match="too early"):
-        all_of(asset)
-    with pytest.raises(zipfile.BadZipFile):
-        open_asset(tmp_path / "all.zip", "dsm.tif")
+    with pytest.raises(AssertionError, match="too early"):
+        sent(file)
+    os.close(file.descriptor)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(5):
+        with pytest.raises(FileNotServedError):
+            open_asset(tmp_path, "dsm.tif")
+    (tmp_path / "all.zip").unlink()
+    (tmp_path / "all.zip").symlink_to("/etc/passwd")
+    with pytest.raises(FileNotServedError):
+        open_asset(tmp_path, "all.zip")
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 def test_outputs_choose_files_and_folders() -> None:

@@ -1,0 +1,1 @@
+"""The node's own page: drop photos, follow runs, open results."""

@@ -1,0 +1,14 @@
+"""The routes of the node's page."""
+
+from __future__ import annotations
+
+from starlette.routing import BaseRoute
+
+from splatpipe.pipeline.app.node.tasks.node import Node
+
+OPEN_PATHS: tuple[str, ...] = ()  # beginnings of paths that need no token: they hold nothing of anybody
+
+
+def page_routes(_node: Node) -> list[BaseRoute]:
+    """The routes, beside those of the API."""
+    return []
