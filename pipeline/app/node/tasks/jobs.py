@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from splatpipe.pipeline.app.node.tasks.uploads import PART, FileFacts
+from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.engine.files.durable import remove_unfinished, sync_folder, write_durably
 from splatpipe.pipeline.engine.files.json_file import json_text, read_json
 from splatpipe.pipeline.engine.files.output_file import own_folder, token
@@ -215,13 +216,17 @@ class JobStore:
         """The OUT of its run."""
         return self.path(key) / "out"
 
-    def assets(self, key: str) -> Path:
-        """The folder of what clients download."""
-        return self.path(key) / "assets"
+    def archive(self, key: str) -> Path:
+        """The all.zip that clients download, whole or in parts."""
+        return self.path(key) / "all.zip"
 
     def output(self, key: str) -> Path:
         """The file of what its run prints."""
         return self.path(key) / "output.txt"
+
+    def labels(self, key: str) -> PathLabels:
+        """Removes the node's folders from what is told of a job."""
+        return PathLabels.of(self.out(key), self.photos(key))
 
 
 def link_files(names: Iterable[str], source: Path, target: Path) -> None:
@@ -238,6 +243,7 @@ def link_files(names: Iterable[str], source: Path, target: Path) -> None:
     target.mkdir(exist_ok=True)
     for name in names:
         if not (target / name).exists():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
             link_file(source / name, target / name)
 
 

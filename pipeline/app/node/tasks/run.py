@@ -15,6 +15,7 @@ from splatpipe.pipeline.app.node.tasks.run_options import RunOptions, run_option
 from splatpipe.pipeline.engine.config import dump
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.output_file import appended_file
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE
 
 Phase = Literal["forecast", "run", "pack"]
@@ -22,6 +23,7 @@ Phase = Literal["forecast", "run", "pack"]
 RUN_MODULE = "splatpipe.pipeline.app.cli.main"
 PACK_MODULE = "splatpipe.pipeline.app.node.assets"  # above this room: started, not imported
 BOUNDARY_FILE, OPTIONS_FILE, FORECAST_FILE = "boundary.geojson", "options.toml", "forecast.json"
+PACKED_FILE = "packed.json"
 MAX_ANSWER_BYTES = 1 << 20
 
 
@@ -39,6 +41,7 @@ class JobProcess:
         self.key, self.phase, self.child, self.progress = job.key, phase, child, progress
         self.forecast = job.forecast
         self.ending_s = 0.0  # when it was asked to end, time.monotonic(); 0 if it was not
+        self.stalled = False  # whether it was asked because nothing moved
 
 
 def prepare(job: Job, jobs: JobStore, source: Path) -> None:
@@ -127,9 +130,30 @@ def start_pack(job: Job, jobs: JobStore) -> JobProcess:
     Raises:
         OSError: if no process can be started.
     """
-    arguments = [str(jobs.out(job.key)), str(jobs.assets(job.key)), "--log", str(jobs.output(job.key))]
+    arguments = [str(jobs.out(job.key)), str(jobs.archive(job.key))]
     arguments += ["--outputs", json.dumps(list(job.outputs))] if job.outputs else []
-    return JobProcess(job, "pack", Child(PACK_MODULE, arguments, jobs.output(job.key)))
+    arguments += ["--task-output", str(jobs.output(job.key))] if jobs.output(job.key).is_file() else []
+    answer = jobs.path(job.key) / PACKED_FILE
+    return JobProcess(job, "pack", Child(PACK_MODULE, arguments, jobs.path(job.key) / "pack.log", answer))
+
+
+def finish_pack(job: Job, jobs: JobStore) -> None:
+    """Add to a job's output what its packing had to say.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    with appended_file(jobs.output(job.key)) as file:
+        file.write("".join(f"{line}\n" for line in read_packed(job, jobs).get("lines", [])).encode())
+
+
+def read_packed(job: Job, jobs: JobStore) -> dict[str, Any]:
+    """What the packing of a job answered; empty if it died before."""
+    try:
+        found = read_json(jobs.path(job.key) / PACKED_FILE, MAX_ANSWER_BYTES)
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def forecast_fields(found: dict[str, Any]) -> dict[str, Any]:

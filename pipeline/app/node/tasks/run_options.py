@@ -11,6 +11,7 @@ from splatpipe.stages.products import CELL_PIXELS, options_for
 DEPTH_MEGAPIXELS = {"ultra": 4.8, "high": 2.4, "medium": 1.2, "low": 0.6, "lowest": 0.3}
 FEATURE_PIXELS = {"ultra": 4000, "high": 2800, "medium": 2000, "low": 1400, "lowest": 1000}
 CM = 0.01
+UNTIL = "until"  # not offered: the node's own page ends a run at a stage, to mark control points, and goes on later
 NOT_TRAINED_UNTIL = "ortho"  # the last stage that an orthophoto needs; training is not among those before it
 
 
@@ -69,10 +70,15 @@ def run_options(given: Mapping[str, Any]) -> RunOptions:
             put("georef", option, given[name])
     if given.get("sky"):
         put("export", "sky", True)
+    if not fast:
+        put("export", "formats", "tiles")
+    formats = [*(["mesh-tiles"] if mesh else []), *(["mbtiles"] if preset != "preview" or "ortho" in asked else [])]
+    if formats and not fast:
+        put("publish", "formats", ",".join(formats))
     return RunOptions(
         preset,
         tables,
-        NOT_TRAINED_UNTIL if fast else "",
+        given.get(UNTIL, "") or (NOT_TRAINED_UNTIL if fast else ""),
         given.get("time-budget", ""),
         given.get("boundary", ""),
     )
