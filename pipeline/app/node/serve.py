@@ -14,11 +14,11 @@ from starlette.types import ASGIApp
 from splatpipe.pipeline.app.node.api.connection import NodeConnection
 from splatpipe.pipeline.app.node.api.guard import Guard
 from splatpipe.pipeline.app.node.api.routes import Api, make_app
-from splatpipe.pipeline.app.node.page.routes import OPEN_PATHS, page_routes
+from splatpipe.pipeline.app.node.page.routes import ESCAPED_PATHS, OPEN_PATHS, page_routes
 from splatpipe.pipeline.app.node.tasks.folder_lock import locked_folder
 from splatpipe.pipeline.app.node.tasks.node import Node
 from splatpipe.pipeline.app.node.tasks.settings import Settings
-from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, StopSignal, UsageError
+from splatpipe.pipeline.engine.errors import MachineError, StopSignal, UsageError
 from splatpipe.pipeline.engine.machine import available_cores
 
 LOOPBACK, PORT = "127.0.0.1", 3000
@@ -81,9 +81,8 @@ def serve(
 
         try:
             _Server(_settings(make_guarded(node, options.token)), listens).run(sockets=[listening])
-        except StopSignal as stopped:
-            if stopped.exit_code != EXIT_INTERRUPTED:
-                raise
+        except StopSignal:  # Ctrl-C and SIGTERM are the normal ways to end the node
+            print_line("Stopped: what was running goes on at the next start.")
         finally:
             listening.close()
             node.stop()
@@ -91,7 +90,7 @@ def serve(
 
 def make_guarded(node: Node, token: str) -> ASGIApp:
     """The application behind its guard."""
-    return Guard(make_app(Api(node), page_routes(node)), token, OPEN_PATHS)
+    return Guard(make_app(Api(node), page_routes(node)), token, OPEN_PATHS, ESCAPED_PATHS)
 
 
 def check_options(options: NodeOptions) -> None:

@@ -6,8 +6,8 @@ there can neither fail a good run nor delay its end, and the command need not lo
 
 from __future__ import annotations
 
-import subprocess
 import os
+import subprocess
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path

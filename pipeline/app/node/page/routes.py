@@ -6,7 +6,8 @@ from starlette.routing import BaseRoute
 
 from splatpipe.pipeline.app.node.tasks.node import Node
 
-OPEN_PATHS: tuple[str, ...] = ()  # beginnings of paths that need no token: they hold nothing of anybody
+OPEN_PATHS: tuple[str, ...] = ()  # beginnings of paths whose requests this room checks itself
+ESCAPED_PATHS: tuple[bytes, ...] = ()  # beginnings of paths that may have escapes
 
 
 def page_routes(_node: Node) -> list[BaseRoute]:

@@ -6,7 +6,7 @@ FOLDER/jobs/KEY/boundary.geojson  the boundary given as an option
 FOLDER/jobs/KEY/options.toml      the options of the run
 FOLDER/jobs/KEY/out/              the run's OUT
 FOLDER/jobs/KEY/output.txt        what the run printed
-FOLDER/jobs/KEY/assets/           what clients download
+FOLDER/jobs/KEY/assets/all.zip    what clients download, whole or in parts
 """
 
 from __future__ import annotations
@@ -216,9 +216,9 @@ class JobStore:
         """The OUT of its run."""
         return self.path(key) / "out"
 
-    def archive(self, key: str) -> Path:
-        """The all.zip that clients download, whole or in parts."""
-        return self.path(key) / "all.zip"
+    def assets(self, key: str) -> Path:
+        """The folder of what clients download."""
+        return self.path(key) / "assets"
 
     def output(self, key: str) -> Path:
         """The file of what its run prints."""

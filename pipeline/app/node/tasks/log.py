@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from splatpipe.pipeline.engine.files.small_file import read_end
@@ -11,24 +11,18 @@ MAX_LOG_BYTES = 8 << 20  # the end of a longer log is kept: a training of a day 
 WORD = "error"  # a line that is only this is taken for a failure by PyODM
 
 
-def log_lines(notes: Sequence[str], output: Path, plain: Callable[[str], str] = str) -> list[str]:
+def log_lines(notes: Sequence[str], output: Path) -> list[str]:
     """The lines of a task's log; what cannot be read is left out.
 
     Args:
         notes: The node's own lines.
         output: What the run printed.
-        plain: Removes the node's folders from a text.
     """
     try:
         text = read_end(output, MAX_LOG_BYTES).decode("utf-8", "replace")
     except OSError:
         text = ""
-    return [*notes, *(f"{line}." if line.strip() == WORD else line.rstrip() for line in plain(text).splitlines())]
-
-
-def from_line(lines: Sequence[str], line: int) -> list[str]:
-    """The lines from one on; a negative number counts from the end."""
-    return list(lines[line:])
+    return [*notes, *(f"{line}." if line.strip() == WORD else line.rstrip() for line in text.splitlines())]
 
 
 def last_line(output: Path) -> str:

@@ -239,20 +239,32 @@ class Node:
             return task
         return task if task.state == "fetching" else self.scheduler.commit(uuid)
 
-    def lines(self, task: Task) -> list[str]:
-        """The lines of a task's log."""
+    def lines(self, task: Task, line: int = 0) -> list[str]:
+        """The lines of a task's log from one on; a negative number counts from the end."""
         if not task.job:
-            return list(task.notes)
-        return log_lines(task.notes, self.jobs.output(task.job), self.jobs.labels(task.job).plain)
+            return list(task.notes)[line:]
+        plain = self.jobs.labels(task.job).plain
+        return [plain(each) for each in log_lines(task.notes, self.jobs.output(task.job))[line:]]
 
-    def archive(self, uuid: str) -> Path | None:
-        """The all.zip of a task; None if it has not completed.
+    def restart(self, uuid: str, options: GivenOptions | None) -> Task:
+        """Run an ended task again, with other options if some are given; valid results are reused.
+
+        Raises:
+            UnknownTaskError: if there is no such task.
+            RefusedTaskError: if it has not ended, or the disk is nearly full.
+            OSError: if the disk is full.
+        """
+        self.require_room()
+        return self.scheduler.restart(uuid, options)
+
+    def results(self, uuid: str) -> Path | None:
+        """The folder of what clients download of a task; None if it has not completed.
 
         Raises:
             UnknownTaskError: if there is no such task.
         """
         task = self.committed(uuid)
-        return self.jobs.archive(task.job) if task.state == "completed" else None
+        return self.jobs.assets(task.job) if task.state == "completed" else None
 
     def info(self, task: Task) -> dict[str, Any]:
         """What ``/task/UUID/info`` answers."""

@@ -15,7 +15,6 @@ from splatpipe.pipeline.app.node.tasks.run_options import RunOptions, run_option
 from splatpipe.pipeline.engine.config import dump
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.json_file import read_json
-from splatpipe.pipeline.engine.files.output_file import appended_file
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE
 
 Phase = Literal["forecast", "run", "pack"]
@@ -23,7 +22,6 @@ Phase = Literal["forecast", "run", "pack"]
 RUN_MODULE = "splatpipe.pipeline.app.cli.main"
 PACK_MODULE = "splatpipe.pipeline.app.node.assets"  # above this room: started, not imported
 BOUNDARY_FILE, OPTIONS_FILE, FORECAST_FILE = "boundary.geojson", "options.toml", "forecast.json"
-PACKED_FILE = "packed.json"
 MAX_ANSWER_BYTES = 1 << 20
 
 
@@ -130,30 +128,9 @@ def start_pack(job: Job, jobs: JobStore) -> JobProcess:
     Raises:
         OSError: if no process can be started.
     """
-    arguments = [str(jobs.out(job.key)), str(jobs.archive(job.key))]
+    arguments = [str(jobs.out(job.key)), str(jobs.assets(job.key)), "--log", str(jobs.output(job.key))]
     arguments += ["--outputs", json.dumps(list(job.outputs))] if job.outputs else []
-    arguments += ["--task-output", str(jobs.output(job.key))] if jobs.output(job.key).is_file() else []
-    answer = jobs.path(job.key) / PACKED_FILE
-    return JobProcess(job, "pack", Child(PACK_MODULE, arguments, jobs.path(job.key) / "pack.log", answer))
-
-
-def finish_pack(job: Job, jobs: JobStore) -> None:
-    """Add to a job's output what its packing had to say.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
-    with appended_file(jobs.output(job.key)) as file:
-        file.write("".join(f"{line}\n" for line in read_packed(job, jobs).get("lines", [])).encode())
-
-
-def read_packed(job: Job, jobs: JobStore) -> dict[str, Any]:
-    """What the packing of a job answered; empty if it died before."""
-    try:
-        found = read_json(jobs.path(job.key) / PACKED_FILE, MAX_ANSWER_BYTES)
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
+    return JobProcess(job, "pack", Child(PACK_MODULE, arguments, jobs.output(job.key)))
 
 
 def forecast_fields(found: dict[str, Any]) -> dict[str, Any]:

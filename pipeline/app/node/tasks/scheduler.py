@@ -18,6 +18,7 @@ from splatpipe.pipeline.app.node.tasks.endings import Verdict, judge_run
 from splatpipe.pipeline.app.node.tasks.jobs import NO_FORECAST, Forecast, Job, JobStore, job_key
 from splatpipe.pipeline.app.node.tasks.log import last_line
 from splatpipe.pipeline.app.node.tasks.names import kind_of
+from splatpipe.pipeline.app.node.tasks.options import GivenOptions
 from splatpipe.pipeline.app.node.tasks.queue import Running, Waiting, next_run, start_times
 from splatpipe.pipeline.app.node.tasks.record import (
     CANCELED,
@@ -30,18 +31,16 @@ from splatpipe.pipeline.app.node.tasks.record import (
 )
 from splatpipe.pipeline.app.node.tasks.run import (
     JobProcess,
-    finish_pack,
     forecast_fields,
     prepare,
     read_forecast,
-    read_packed,
     start_forecast,
     start_pack,
     start_run,
 )
 from splatpipe.pipeline.app.node.tasks.settings import Settings
-from splatpipe.pipeline.app.node.tasks.uploads import FileFacts
 from splatpipe.pipeline.app.node.tasks.store import TaskStore, UnknownTaskError, now_ms
+from splatpipe.pipeline.app.node.tasks.uploads import FileFacts
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, SplatpipeError
 from splatpipe.pipeline.engine.machine import available_memory_bytes, free_memory_bytes
 
@@ -220,7 +219,7 @@ class Scheduler:
             self._changed.notify_all()
         self._await_end(task.job)
 
-    def restart(self, uuid: str, options: Mapping[str, Any] | None, dropped: tuple[str, ...] = ()) -> Task:
+    def restart(self, uuid: str, options: GivenOptions | None) -> Task:
         """Run an ended task again, with other options if some are given; valid results are reused.
 
         Raises:
@@ -234,15 +233,15 @@ class Scheduler:
             if not photos:
                 raise RefusedTaskError("Task cannot be restarted")
             notes = tuple(line for line in task.notes if not line.startswith(DROPPED))
-            notes += _dropped_note(task.dropped if options is None else dropped)
-            task = replace(task, options=task.options if options is None else dict(options))
+            if options is not None:
+                task = replace(task, options=dict(options.values), dropped=options.dropped)
+            notes += _dropped_note(task.dropped)
             job = self._join(job_key(photos, task.options, task.outputs), photos, task, seed=task.job)
             task = self.tasks.replace(
                 replace(
                     task,
                     state="wanted",
                     job=job.key,
-                    dropped=task.dropped if options is None else dropped,
                     notes=notes,
                     error="",
                     processing_ms=NEVER_STARTED,
@@ -290,8 +289,7 @@ class Scheduler:
             return TaskStatus(CANCELED, 0.0, NEVER_STARTED, forecast=forecast)
         if job is None or process is None or process.phase == "forecast" or job.state in ("new", "queued"):
             waiting = "" if job is None else job.waiting
-            starts_in_s = 0.0 if job is None else self._start_times().get(job.key, 0.0)
-            return TaskStatus(QUEUED, 0.0, NEVER_STARTED, waiting=waiting, starts_in_s=starts_in_s, forecast=forecast)
+            return TaskStatus(QUEUED, 0.0, NEVER_STARTED, waiting=waiting, forecast=forecast)
         progress = process.progress
         spent_s = job.seconds + time.monotonic() - process.child.began_s
         return TaskStatus(
@@ -472,12 +470,9 @@ class Scheduler:
 
     def _pack_ended(self, job: Job, code: int, spent_s: float, wanted: bool) -> None:
         if code == 0:
-            with suppress(OSError):  # a full disk: the log lacks some lines
-                finish_pack(job, self.jobs)
             self._settle(self.jobs.change(job.key, state="done", seconds=spent_s, ended_ms=now_ms(), waiting=""))
         elif wanted:
-            found = read_packed(job, self.jobs)
-            text = f"The results could not be packed. {found.get('error', '')} {found.get('hint', '')}".strip()
+            text = last_line(self.jobs.output(job.key))
             self._judge(job, judge_run(EXIT_MACHINE if code == EXIT_MACHINE else EXIT_STAGE, text, "", job.tries))
 
     def _judge(self, job: Job, verdict: Verdict) -> None:
