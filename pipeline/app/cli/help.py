@@ -111,6 +111,13 @@ PAGES = {
         ("view OUT", "view OUT --mark --points control.csv"),
         "docs/viewing.md",
     ),
+    "node": HelpPage(
+        "Takes photos over HTTP as NodeODM does, so that WebODM, CloudODM, ClusterODM and PyODM can use it. Keeps "
+        "uploads, runs and results in FOLDER, and goes on where it was when it is started again. It listens on this "
+        "machine only, unless --host and a token are given, and is not encrypted: put a proxy in front of it.",
+        ("node ~/node", "node /srv/node --host 0.0.0.0 --parallel 2 --keep 30"),
+        "docs/node.md",
+    ),
     "status": HelpPage(
         "Reads OUT, even during a run, and changes nothing.",
         ("status OUT",),

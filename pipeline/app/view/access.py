@@ -14,13 +14,14 @@ are secret, each for its own reason:
 
 from __future__ import annotations
 
-import hmac
 import os
 import secrets
 import socket
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from splatpipe.pipeline.app.serving.refusals import same
 
 COOKIE = "splatpipe"
 KEY = "?key="
@@ -71,11 +72,6 @@ class Access:
     def set_cookie(self) -> str:
         """The value of the Set-Cookie header."""
         return f"{COOKIE}={self.cookie}; Path=/{self.pages}; HttpOnly; SameSite=Strict"
-
-
-def same(given: bytes, secret: str) -> bool:
-    """Compare in a time that does not depend on how much agrees."""
-    return hmac.compare_digest(given, secret.encode())
 
 
 def user_of(client: tuple[str, int] | None, server: tuple[str, int | None] | None) -> int | None:

@@ -10,21 +10,19 @@ segment: paths that have them are rejected before they are decoded.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from splatpipe.pipeline.app.view.access import Access, same
+from splatpipe.pipeline.app.serving.refusals import HOSTS, RefusedError, check_origin, only_header, same
+from splatpipe.pipeline.app.view.access import Access
 
-HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")  # any port: a tunnel may use a different one
 PATH = re.compile(rb"/(?:\w[\w.-]*(?:/\w[\w.-]*)*)?", re.ASCII)
 MAX_PATH_LETTERS = 240
 MAX_BODY_BYTES = 16 << 10
 METHODS = ("GET", "HEAD", "POST")
-FOREIGN = ("cross-site", "same-site")  # values of Sec-Fetch-Site: another site, or another port of this machine
 FIRST_PAGE = "run"  # where an address without a path leads
 NO_KEY = (
     "Open the address that splatpipe view printed in the terminal where it runs, with its ?key=. Others are not shown"
@@ -69,14 +67,6 @@ HEADERS = {
 }
 
 
-class RefusedError(Exception):
-    """A rejected request."""
-
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-
-
 class Guard:
     """Passes only requests that have a secret of this server.
 
@@ -116,7 +106,7 @@ class Guard:
         Raises:
             RefusedError: if it is not allowed.
         """
-        host = _only(scope["headers"], b"host", "Host")
+        host = only_header(scope["headers"], b"host", "Host")
         if not self._any_host and HOSTS.fullmatch(host) is None:
             raise RefusedError(421, "This is splatpipe view on this machine; it answers to 127.0.0.1 and localhost.")
         if scope["method"] not in METHODS:
@@ -141,7 +131,7 @@ class Guard:
             return not is_post
         if not same(folder, self._access.pages) or not self._access.has_cookie(headers.get("cookie", "")):
             return False
-        _check_origin(headers)
+        check_origin(headers)
         if is_post:
             _check_writing(headers)
         return True
@@ -158,14 +148,6 @@ class Guard:
         return HTMLResponse(ENTRANCE.format(to=to), headers={"set-cookie": self._access.set_cookie()})
 
 
-def _check_origin(headers: Headers) -> None:
-    origin = headers.get("origin")
-    if origin is not None and origin != f"http://{headers['host']}":
-        raise RefusedError(403, "Request from another page refused.")
-    if headers.get("sec-fetch-site") in FOREIGN and headers.get("sec-fetch-mode") != "navigate":
-        raise RefusedError(403, "Request from another site refused.")
-
-
 def _check_writing(headers: Headers) -> None:
     if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
         raise RefusedError(415, "The request must be JSON.")
@@ -174,13 +156,6 @@ def _check_writing(headers: Headers) -> None:
         raise RefusedError(411, "Content-Length is required.")
     if int(length) > MAX_BODY_BYTES:
         raise RefusedError(413, "The request is too large.")
-
-
-def _only(headers: Iterable[tuple[bytes, bytes]], name: bytes, title: str) -> str:
-    found = [value for key, value in headers if key == name]
-    if len(found) != 1:
-        raise RefusedError(400, f"Exactly one {title} header is required.")
-    return found[0].decode("latin-1")
 
 
 async def _body(receive: Receive) -> bytes:

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from splatpipe.pipeline.app.report import PDF_FILE, REPORT_FILE
-from splatpipe.pipeline.app.view.files import FileNotServedError, is_inside, open_inside
+from splatpipe.pipeline.app.serving.files import FileNotServedError, is_inside, open_inside
 from splatpipe.pipeline.app.view.log import RunLog
 from splatpipe.pipeline.engine.files.json_file import parse_json
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE, RunFolder

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatpipe.pipeline.app.view.files import FileNotServedError, open_inside
+from splatpipe.pipeline.app.serving.files import FileNotServedError, open_inside
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import parse_event
 from splatpipe.pipeline.engine.runs.run_folder import Contents, RunFolder

@@ -13,8 +13,8 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from splatpipe.pipeline.app.serving.files import TYPES, FileAnswer, FileNotServedError, open_inside
 from splatpipe.pipeline.app.view.access import Access
-from splatpipe.pipeline.app.view.files import TYPES, FileAnswer, FileNotServedError, open_inside
 from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, FIRST_PAGE, OF_RUN
 from splatpipe.pipeline.app.view.landing import downloadable_files, landing
 from splatpipe.pipeline.app.view.live import Live

@@ -19,8 +19,8 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.types import ASGIApp
 
+from splatpipe.pipeline.app.serving.connection import Connection
 from splatpipe.pipeline.app.view.access import KEY, Access
-from splatpipe.pipeline.app.view.connection import Connection
 from splatpipe.pipeline.app.view.guard import Guard
 from splatpipe.pipeline.app.view.live import Live
 from splatpipe.pipeline.app.view.run_pages import Pages

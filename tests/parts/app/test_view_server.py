@@ -19,9 +19,9 @@ from served import Served, serving
 from timeouts import TIMEOUT_S, wait_until
 from view_home import SECRET, WEB, refused
 
+from splatpipe.pipeline.app.serving.connection import REQUEST_S
+from splatpipe.pipeline.app.serving.files import FileNotServedError, open_inside, parse_range
 from splatpipe.pipeline.app.view.access import user_of
-from splatpipe.pipeline.app.view.connection import REQUEST_S
-from splatpipe.pipeline.app.view.files import FileNotServedError, open_inside, parse_range
 from splatpipe.pipeline.app.view.log import MAX_POINTS, Curve, RunLog
 
 

@@ -1,0 +1,1 @@
+"""The node's HTTP interface: NodeODM's calls, what a request may be, and who may send it."""

@@ -1,0 +1,63 @@
+"""Bodies of requests as they arrive, and the small ones whole."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Any
+from urllib.parse import parse_qsl
+
+from starlette.requests import ClientDisconnect, Request
+
+from splatpipe.pipeline.app.node.api.multipart import BadBodyError
+from splatpipe.pipeline.engine.files.json_file import parse_json
+
+MAX_SMALL_BYTES = 4 << 20  # options with a boundary, urlencoded
+MAX_FIELDS = 32
+
+
+async def limited(request: Request, max_bytes: int) -> AsyncIterator[bytes]:
+    """The body in pieces.
+
+    Raises:
+        BadBodyError: if it has more bytes, or ends too early.
+    """
+    size = 0
+    try:
+        async for chunk in request.stream():
+            size += len(chunk)
+            if size > max_bytes:
+                raise BadBodyError("The request is too large.")
+            if chunk:
+                yield chunk
+    except ClientDisconnect as error:
+        raise BadBodyError("The request ended too early.") from error
+
+
+async def small_body(request: Request) -> dict[str, Any]:
+    """The fields of a urlencoded or JSON body.
+
+    Raises:
+        BadBodyError: if it is neither, or too large.
+    """
+    data = b"".join([chunk async for chunk in limited(request, MAX_SMALL_BYTES)])
+    if not data.strip():
+        return {}
+    try:
+        if "json" in request.headers.get("content-type", "").lower():
+            found = parse_json(data)
+            if not isinstance(found, dict):
+                raise ValueError("it is no object")
+            return found
+        return dict(parse_qsl(data.decode(), keep_blank_values=True, max_num_fields=MAX_FIELDS))
+    except (ValueError, UnicodeError) as error:
+        raise BadBodyError("The request is neither JSON nor urlencoded.") from error
+
+
+async def drain(request: Request, max_bytes: int) -> None:
+    """Read a body that is of no interest, so that its client can read the answer.
+
+    Raises:
+        BadBodyError: if it has more bytes, or ends too early.
+    """
+    async for _ in limited(request, max_bytes):
+        pass

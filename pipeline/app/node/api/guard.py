@@ -1,0 +1,118 @@
+"""Who may send a request, and what one may look like, before anything of it is handled.
+
+Without a token the node listens on this machine only. Every page in a browser here can send it requests, so that the
+Host must name this machine and the Origin, if there is one, be the node's own; other pages may not read answers. With a
+token the node is called by its name from anywhere: any Host is right, any page may read what the token opens, and no
+cookie exists that a page could misuse.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from urllib.parse import parse_qs
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from splatpipe.pipeline.app.node.api.answers import BAD_TOKEN
+from splatpipe.pipeline.app.serving.refusals import HOSTS, RefusedError, check_origin, only_header, same
+
+PATH = re.compile(rb"/(?:\w[\w.~-]*(?:/\w[\w.~-]*)*/?)?", re.ASCII)  # no escapes, no dots first
+MAX_PATH_LETTERS = 400
+MAX_QUERY_LETTERS = 4096
+MAX_PARAMETERS = 32
+METHODS = ("GET", "HEAD", "POST", "OPTIONS")
+HEADERS = {
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "permissions-policy": "camera=(), microphone=(), geolocation=()",
+    "cache-control": "no-store",
+    "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
+}
+CORS = {
+    "access-control-allow-origin": "*",
+    "access-control-allow-methods": "GET, HEAD, POST, OPTIONS",
+    "access-control-allow-headers": "Content-Type, Range, Set-Uuid",
+    "access-control-expose-headers": "Content-Length, Content-Range, Accept-Ranges",
+    "access-control-max-age": "600",
+}
+OPEN_CALLS = ("/auth/info", "/auth/login", "/auth/register")
+
+
+class Guard:
+    """Passes only requests that may be handled.
+
+    Args:
+        app: The application behind it.
+        token: The token; empty for none.
+        open_paths: Beginnings of paths that need no token: the page's own files, which hold nothing of anybody.
+        escaped: Beginnings of paths in which names of files may be escaped.
+    """
+
+    def __init__(self, app: ASGIApp, token: str, open_paths: Sequence[str] = (), escaped: Sequence[bytes] = ()) -> None:
+        self._app, self._token = app, token
+        self._open, self._escaped = tuple(open_paths), tuple(escaped)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        answered = _with_headers(send, HEADERS | (CORS if self._token else {}))
+        try:
+            self._check(scope)
+        except RefusedError as error:
+            await PlainTextResponse(f"{error}\n", error.status, {"connection": "close"})(scope, receive, answered)
+            return
+        if scope["method"] == "OPTIONS":
+            await Response(status_code=204 if self._token else 405)(scope, receive, answered)
+        elif not self._opens(scope):
+            await JSONResponse({"error": BAD_TOKEN}, headers={"connection": "close"})(scope, receive, answered)
+        else:
+            await self._app(scope, receive, answered)
+
+    def _check(self, scope: Scope) -> None:
+        """Check a request, whoever sends it.
+
+        Raises:
+            RefusedError: if it is not allowed.
+        """
+        host = only_header(scope["headers"], b"host", "Host")
+        headers = Headers(scope=scope)
+        if not self._token:
+            if HOSTS.fullmatch(host) is None:
+                raise RefusedError(421, "This node has no token; it answers to 127.0.0.1 and localhost only.")
+            check_origin(headers)
+        if scope["method"] not in METHODS:
+            raise RefusedError(405, "Only GET, HEAD and POST are accepted.")
+        path: bytes = scope.get("raw_path") or b""
+        plain = not path.startswith(self._escaped) if self._escaped else True
+        if len(path) > MAX_PATH_LETTERS or (plain and PATH.fullmatch(path) is None):
+            raise RefusedError(404, "Not found.")
+        if len(scope["query_string"]) > MAX_QUERY_LETTERS:
+            raise RefusedError(414, "The address is too long.")
+        has_body = headers.get("transfer-encoding") or headers.get("content-length", "0") != "0"
+        if scope["method"] != "POST" and has_body:
+            raise RefusedError(400, "A read request must not have a body.")
+
+    def _opens(self, scope: Scope) -> bool:
+        """Whether a request carries the token, or needs none."""
+        path = scope["path"]
+        if not self._token or path in OPEN_CALLS or path == "/" or path.startswith(self._open or ("\0",)):
+            return True
+        try:
+            given = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=MAX_PARAMETERS)
+        except ValueError:
+            return False
+        return same(given.get("token", [""])[0].encode("utf-8", "surrogateescape"), self._token)
+
+
+def _with_headers(send: Send, headers: dict[str, str]) -> Send:
+    async def answered(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            mutable = MutableHeaders(scope=message)
+            for name, value in headers.items():
+                mutable.setdefault(name, value)
+        await send(message)
+
+    return answered
