@@ -38,6 +38,8 @@ CORS = {
     "access-control-expose-headers": "Content-Length, Content-Range, Accept-Ranges",
     "access-control-max-age": "600",
 }
+PAGES = ("/page/", "/results/")  # of the page, which looks after them itself (page/gate.py)
+SANDBOXED = "/results/"  # a run's own pages have no origin
 OPEN_CALLS = ("/auth/info", "/auth/login", "/auth/register")
 
 
@@ -49,23 +51,32 @@ class Guard:
         token: The token; empty for none.
         open_paths: Beginnings of paths that need no token: the page's own files, which hold nothing of anybody.
         escaped: Beginnings of paths in which names of files may be escaped.
+        local: Whether only this machine calls it, even with a token, so that Host and Origin are checked.
     """
 
-    def __init__(self, app: ASGIApp, token: str, open_paths: Sequence[str] = (), escaped: Sequence[bytes] = ()) -> None:
-        self._app, self._token = app, token
+    def __init__(
+        self,
+        app: ASGIApp,
+        token: str,
+        open_paths: Sequence[str] = (),
+        escaped: Sequence[bytes] = (),
+        *,
+        local: bool = False,
+    ) -> None:
+        self._app, self._token, self._local = app, token, local or not token
         self._open, self._escaped = tuple(open_paths), tuple(escaped)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        answered = _with_headers(send, HEADERS | (CORS if self._token else {}))
+        answered = _with_headers(send, HEADERS | ({} if self._local else CORS))
         try:
             self._check(scope)
         except RefusedError as error:
             await PlainTextResponse(f"{error}\n", error.status, {"connection": "close"})(scope, receive, answered)
             return
         if scope["method"] == "OPTIONS":
-            await Response(status_code=204 if self._token else 405)(scope, receive, answered)
+            await Response(status_code=405 if self._local else 204)(scope, receive, answered)
         elif not self._opens(scope):
             await JSONResponse({"error": BAD_TOKEN}, headers={"connection": "close"})(scope, receive, answered)
         else:
@@ -79,10 +90,11 @@ class Guard:
         """
         host = only_header(scope["headers"], b"host", "Host")
         headers = Headers(scope=scope)
-        if not self._token:
+        if self._local:
             if HOSTS.fullmatch(host) is None:
-                raise RefusedError(421, "This node has no token; it answers to 127.0.0.1 and localhost only.")
-            check_origin(headers)
+                raise RefusedError(421, "This node is for this machine; it answers to 127.0.0.1 and localhost only.")
+            if not scope["path"].startswith(SANDBOXED):
+                check_origin(headers)
         if scope["method"] not in METHODS:
             raise RefusedError(405, "Only GET, HEAD and POST are accepted.")
         path: bytes = scope.get("raw_path") or b""

@@ -48,7 +48,7 @@ class Upload:
 
 
 class Checks:
-    """The checks of a node. ``advance`` is called regularly, by one thread: a process dies with the thread that made it.
+    """The checks of a node. One thread calls ``advance`` regularly: a process dies with the thread that made it.
 
     Args:
         threads: Threads of a check.

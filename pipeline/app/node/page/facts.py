@@ -17,7 +17,7 @@ from splatpipe.pipeline.app.node.tasks.disk import free_bytes
 from splatpipe.pipeline.app.node.tasks.jobs import Job
 from splatpipe.pipeline.app.node.tasks.names import CONTROL_NAMES, control_file, kind_of
 from splatpipe.pipeline.app.node.tasks.node import Node
-from splatpipe.pipeline.app.node.tasks.options import CATALOGUE
+from splatpipe.pipeline.app.node.tasks.options import LISTED
 from splatpipe.pipeline.app.node.tasks.record import QUEUED, RUNNING, Task
 from splatpipe.pipeline.app.node.tasks.run_options import MARK_FIRST
 from splatpipe.pipeline.app.node.tasks.scheduler import TaskStatus
@@ -87,7 +87,7 @@ class Facts:
         listed.sort(key=lambda each: (order.get(each["state"], 0), each["place"] or 0))
         return {
             "node": self._node(version, sum(each.code == RUNNING for each in statuses.values())),
-            "options": [option.as_json() for option in CATALOGUE if option.name != MARK_FIRST],
+            "options": [option.as_json() for option in LISTED],
             "tasks": listed,
             "more": len(tasks) - len(shown),
         }
@@ -219,4 +219,6 @@ def state_of(task: Task, status: TaskStatus | None) -> str:
 
 def survey_names() -> dict[str, str]:
     """The survey files that a run finds beside photos, by name, and what each is."""
-    return {name: SURVEY.get(file.part, file.part) for stage in LINE for file in stage.files.values() for name in file.names}
+    return {
+        name: SURVEY.get(file.part, file.part) for stage in LINE for file in stage.files.values() for name in file.names
+    }

@@ -21,7 +21,7 @@ from splatpipe.pipeline.app.view.access import Access
 from splatpipe.pipeline.engine.files.small_file import read_small
 
 COOKIE = "splatpipe-node"
-SECRET_FILE = "page.secret"  # noqa: S105
+SECRET_FILE = "page.secret"
 SECRET_LETTERS = 64
 OURS, RESULTS = "page", "results"  # first folders of addresses: our pages, files of runs
 COOKIE_DAYS = 30
@@ -117,6 +117,19 @@ def page_access(folder: Path, token: str) -> PageAccess:
     Raises:
         OSError: if the secret cannot be read or written.
     """
+    return PageAccess(token, _secret(folder))
+
+
+def own_token(folder: Path) -> str:
+    """The token of a node for one person, who does not have to know it: the same whenever it is started.
+
+    Raises:
+        OSError: if the folder's secret cannot be read or written.
+    """
+    return hmac.new(_secret(folder).encode(), b"own token", "sha256").hexdigest()[:32]
+
+
+def _secret(folder: Path) -> str:
     path = folder / SECRET_FILE
     try:
         secret = read_small(path, 2 * SECRET_LETTERS).decode("ascii").strip()
@@ -125,6 +138,6 @@ def page_access(folder: Path, token: str) -> PageAccess:
     if len(secret) != SECRET_LETTERS:
         secret = secrets.token_hex(SECRET_LETTERS // 2)
         path.unlink(missing_ok=True)  # a half one
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "w") as file:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "w") as file:
             file.write(secret)
-    return PageAccess(token, secret)
+    return secret

@@ -61,7 +61,13 @@ class Results:
             except OSError:
                 continue
             inside = PurePosixPath(name).suffix in BROWSER_SUFFIXES
-            entry = {"title": name, "text": WHAT.get(name, ""), "href": f"/{folder}/{name}", "bytes": size, "inside": inside}
+            entry = {
+                "title": name,
+                "text": WHAT.get(name, ""),
+                "href": f"/{folder}/{name}",
+                "bytes": size,
+                "inside": inside,
+            }
             found += [entry | {"title": MAIN[name], "main": True}] if name in MAIN else []
             found.append(entry)
         packed = self._jobs.assets(task.job) / ALL

@@ -1,16 +1,15 @@
 """The addresses of the page: entrance, our pages and their JSON behind a cookie, and the files of runs in a sandbox.
 
-    /                              the entrance: asks for the token, or takes the key of the printed address
-    /page/enter, /page/assets/…    what it needs
-    /page/SECRET/                  the page; below it its JSON, the node's API as clients use it, check pages, views
-    /results/UUID/MAC/…            files of a run
+/                              the entrance: asks for the token, or takes the key of the printed address
+/page/enter, /page/assets/…    what it needs
+/page/SECRET/                  the page; below it its JSON, the node's API as clients use it, check pages, views
+/results/UUID/MAC/…            files of a run
 """
 
 from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -44,7 +43,6 @@ from splatpipe.pipeline.app.node.tasks.uploads import NameTakenError
 from splatpipe.pipeline.app.serving.files import TYPES, FileAnswer, FileNotServedError, open_inside
 from splatpipe.pipeline.app.serving.refusals import RefusedError
 from splatpipe.pipeline.app.view.guard import CSP_OF_RUN, CSP_OF_SITE, CSP_OURS, ENTRANCE, OF_RUN
-from splatpipe.pipeline.app.view.run_pages import ALONE
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.web import asset
 from splatpipe.pipeline.web.measured_page import SITE
@@ -55,7 +53,7 @@ MAX_JSON_BYTES = 3 << 20  # options with a boundary
 MAX_TOKEN_LETTERS = 512
 MAX_NAME_LETTERS = 200
 LOOK_S = 0.3
-HTML = {"content-security-policy": CSP_OURS, **ALONE}
+HTML = {"content-security-policy": CSP_OURS, "cross-origin-opener-policy": "same-origin"}
 VIEW_PAGES = ("mark", "live")
 PASSED_ON = ("content-type", "if-none-match", "accept")
 
@@ -125,7 +123,8 @@ class Page:
         refusals: dict[Any, int] = {UnknownTaskError: 404, RefusedTaskError: 409, NameTakenError: 409}
         refusals |= {WrongOptionsError: 422, BadNameError: 422, BadBodyError: 400}
         handlers: dict[Any, Any] = {
-            error: lambda _request, error, status=status: _said(status, _words(error)) for error, status in refusals.items()
+            error: lambda _request, error, status=status: _said(status, _words(error))
+            for error, status in refusals.items()
         }
         handlers |= {
             MachineError: lambda _request, error: _said(503, f"{error.message} {error.hint}".strip()),
@@ -281,7 +280,9 @@ class Page:
             task = self._tasks.get(given["uuid"])
         except UnknownTaskError as error:
             raise HTTPException(404) from error
-        if not self._access.opens_results(task.uuid, given["mac"]) or given["path"] not in self._facts.result_names(task):
+        if not self._access.opens_results(task.uuid, given["mac"]) or given["path"] not in self._facts.result_names(
+            task
+        ):
             raise HTTPException(404)
         try:
             file = open_inside(self._jobs.out(task.job), given["path"])

@@ -15,10 +15,10 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from splatpipe.pipeline.app.node.page.view_process import MODULE
 from splatpipe.pipeline.app.node.tasks.child import Child
 from splatpipe.pipeline.engine.errors import MachineError
 
+MODULE = "splatpipe.pipeline.app.node.page.view_process"  # started, not imported: it loads what is large
 MOST = 3  # processes; each has some hundred megabytes
 IDLE_S = 900.0
 START_S = 60.0  # on a busy machine; it imports for seconds
@@ -106,7 +106,9 @@ class ViewChildren:
             except (FileNotFoundError, ConnectionRefusedError) as error:
                 connection.close()
                 if shown.child.poll() is not None or time.monotonic() > deadline:
-                    raise MachineError("This view cannot be opened; the node's machine may be out of memory.") from error
+                    raise MachineError(
+                        "This view cannot be opened; the node's machine may be out of memory."
+                    ) from error
                 time.sleep(POLL_S)
         answer = connection.getresponse()
         kept = {name: value for name in PASSED_ON if (value := answer.headers.get(name)) is not None}

@@ -38,7 +38,6 @@ from splatpipe.pipeline.photos.files.names import NameFinder
 from splatpipe.pipeline.survey.files.control_edit import ControlText
 from splatpipe.stages.line import LINE
 
-MODULE = "splatpipe.pipeline.app.node.page.view_process"
 BACKLOG = 16
 
 
@@ -135,7 +134,9 @@ def _refusing(error: SplatpipeError, given: dict[str, Any]) -> ASGIApp:
 
 
 def _failed(error: SplatpipeError, given: dict[str, Any]) -> Response:
-    return JSONResponse({"message": _without_paths(error.message, given), "hint": _without_paths(error.hint, given)}, 500)
+    return JSONResponse(
+        {"message": _without_paths(error.message, given), "hint": _without_paths(error.hint, given)}, 500
+    )
 
 
 def _without_paths(text: str, given: dict[str, Any]) -> str:

@@ -219,7 +219,8 @@ class Scheduler:
             before = self.jobs.get(task.job)
             if not task.has_ended or (before is None and not self.tasks.uploads(uuid).names()):
                 raise RefusedTaskError("Task cannot be restarted")
-            photos = self.tasks.uploads(uuid).digests() if before is None else before.photos
+            own = self.tasks.uploads(uuid).digests()  # marks may have changed its control file since
+            photos = own if before is None or own.keys() >= before.photos.keys() else before.photos
             notes = tuple(line for line in task.notes if not line.startswith("Options that"))
             if dropped:
                 notes += (f"Options that this node does not offer were ignored: {', '.join(dropped)}",)
