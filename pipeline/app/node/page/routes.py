@@ -230,8 +230,15 @@ class Page:
         values = dict(task.options) if body.get("options") is None else dict(_options(body).values)
         values.pop(MARK_FIRST, None)
         values |= {MARK_FIRST: True} if body.get("pause") is True else {}
-        await to_thread.run_sync(self.views.stop, task.uuid)
-        await to_thread.run_sync(self._scheduler.restart, task.uuid, values)
+
+        def restart() -> None:
+            self.views.stop(task.uuid)
+            control = self._facts.control(task)
+            if control is not None:  # the page for marking has changed it where it lies
+                self._tasks.uploads(task.uuid).forget(control)
+            self._scheduler.restart(task.uuid, values)
+
+        await to_thread.run_sync(restart)
         return JSONResponse({"success": True})
 
     def _uploading(self, request: Request) -> Task:
