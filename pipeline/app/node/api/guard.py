@@ -38,6 +38,8 @@ CORS = {
     "access-control-expose-headers": "Content-Length, Content-Range, Accept-Ranges",
     "access-control-max-age": "600",
 }
+PAGES = ("/page/", "/results/")  # of the page, which looks after them itself (page/gate.py)
+SANDBOXED = "/results/"  # a run's own pages have no origin
 OPEN_CALLS = ("/auth/info", "/auth/login", "/auth/register")
 
 
@@ -49,16 +51,25 @@ class Guard:
         token: The token; empty for none.
         open_paths: Beginnings of paths whose requests are checked by who handles them: no token, no Origin, no CORS.
         escaped: Beginnings of paths in which names of files may be escaped.
+        local: Whether only this machine calls it, even with a token, so that Host and Origin are checked.
     """
 
-    def __init__(self, app: ASGIApp, token: str, open_paths: Sequence[str] = (), escaped: Sequence[bytes] = ()) -> None:
-        self._app, self._token = app, token
+    def __init__(
+        self,
+        app: ASGIApp,
+        token: str,
+        open_paths: Sequence[str] = (),
+        escaped: Sequence[bytes] = (),
+        *,
+        local: bool = False,
+    ) -> None:
+        self._app, self._token, self._local = app, token, local or not token
         self._open, self._escaped = tuple(open_paths), tuple(escaped)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        has_cors = self._token and not self._is_open(scope)
+        has_cors = not self._local and not self._is_open(scope)
         answered = _with_headers(send, HEADERS | (CORS if has_cors else {}))
         try:
             self._check(scope)
@@ -80,10 +91,10 @@ class Guard:
         """
         host = only_header(scope["headers"], b"host", "Host")
         headers = Headers(scope=scope)
-        if not self._token:
+        if self._local:
             if HOSTS.fullmatch(host) is None:
-                raise RefusedError(421, "This node has no token; it answers to 127.0.0.1 and localhost only.")
-            if not self._is_open(scope):
+                raise RefusedError(421, "This node is for this machine; it answers to 127.0.0.1 and localhost only.")
+            if not scope["path"].startswith(SANDBOXED):
                 check_origin(headers)
         if scope["method"] not in METHODS:
             raise RefusedError(405, "Only GET, HEAD and POST are accepted.")

@@ -25,7 +25,7 @@ from splatpipe.pipeline.app.node.assets.single import is_asset, media_type, open
 from splatpipe.pipeline.app.node.tasks.disk import free_bytes
 from splatpipe.pipeline.app.node.tasks.names import BadNameError
 from splatpipe.pipeline.app.node.tasks.node import NewTask, Node
-from splatpipe.pipeline.app.node.tasks.options import CATALOGUE, WrongOptionsError, parse_options
+from splatpipe.pipeline.app.node.tasks.options import LISTED, WrongOptionsError, parse_options
 from splatpipe.pipeline.app.node.tasks.outgoing import OutgoingError
 from splatpipe.pipeline.app.node.tasks.scheduler import RefusedTaskError
 from splatpipe.pipeline.app.node.tasks.settings import MAX_FILES, MAX_TASK_BYTES
@@ -103,7 +103,7 @@ class Api:
 
     async def options(self, _request: Request) -> Response:
         """The options that tasks take."""
-        return answer([option.as_json() for option in CATALOGUE])
+        return answer([option.as_json() for option in LISTED])
 
     async def auth_info(self, _request: Request) -> Response:
         """How to log in: not at all."""

@@ -55,6 +55,7 @@ class Option:
         domain: What values it takes: a rule in ODM's words, or the choices of an ``enum``.
         help: What it does.
         check: Converts a value of the right type further; raises OptionValueError.
+        listed: Whether ``/options`` has it: only the node's own page knows what to do after the others.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Option:
     domain: str | tuple[str, ...]
     help: str
     check: Callable[[Any], Any] = lambda value: value
+    listed: bool = True
 
     def as_json(self) -> dict[str, Any]:
         """The item of ``/options``: clients take exactly these keys, and only a text as value."""
@@ -278,7 +280,16 @@ CATALOGUE = (
         _duration,
     ),
     Option("sky", "bool", "false", "bool", "Keep the sky as a picture around the splat."),
+    Option(
+        "mark-first",
+        "bool",
+        "false",
+        "bool",
+        "Stop before the training, so that control points can be marked on the node's page.",
+        listed=False,
+    ),
 )
+LISTED = tuple(option for option in CATALOGUE if option.listed)
 BY_NAME = {option.name: option for option in CATALOGUE}
 
 

@@ -120,6 +120,12 @@ class UploadFolder:
         with self._lock:
             return {name: self._facts[name] for name in sorted(present)}
 
+    def forget(self, name: str) -> None:
+        """Take note that a file was changed where it lies: its digest is read again when it is needed."""
+        with self._lock:
+            self._facts[name] = FileFacts(-1, "")
+            self._note(name, self._facts[name])
+
     def replace_by(self, name: str, same: Path) -> None:
         """Replace a file by a hard link to another with the same bytes, so that they are stored once.
 
