@@ -18,7 +18,7 @@ from starlette.routing import BaseRoute, Route
 
 from splatpipe.pipeline.app.node.api.answers import DISK_FULL, SUCCESS, answer, error_answer, failure, option_errors
 from splatpipe.pipeline.app.node.api.bodies import drain, drain_rest, limited, small_body
-from splatpipe.pipeline.app.node.api.multipart import BadBodyError, Form, read_form
+from splatpipe.pipeline.app.node.api.multipart import BadBodyError, Form, block_bytes, read_form
 from splatpipe.pipeline.app.node.api.received import UploadedFile, refuse_files
 from splatpipe.pipeline.app.node.assets.outputs import parse_outputs
 from splatpipe.pipeline.app.node.assets.single import is_asset, media_type, open_asset
@@ -56,6 +56,7 @@ class Api:
         self.node = node
         self._folders = folders
         self._commands = CapacityLimiter(COMMANDS_AT_ONCE)
+        self._receiving = 0  # bodies that are received now
 
     def routes(self) -> list[BaseRoute]:
         """The routes."""
@@ -260,7 +261,11 @@ class Api:
     async def _form(self, request: Request, max_bytes: int, open_file: Any) -> Form:
         body = limited(request, max_bytes)
         kind = request.headers.get("content-type", "")
-        return await read_form(kind, body, open_file, to_thread.run_sync)
+        self._receiving += 1
+        try:
+            return await read_form(kind, body, open_file, to_thread.run_sync, block_bytes(self._receiving))
+        finally:
+            self._receiving -= 1
 
 
 def make_app(api: Api, further: list[BaseRoute]) -> Starlette:
