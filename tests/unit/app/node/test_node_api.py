@@ -21,10 +21,8 @@ FORM = ("content-type", "multipart/form-data; boundary=xyz")
 
 
 def _form(files: dict[str, bytes] | None = None, **fields: str) -> bytes:
-    parts = [
-        f'--xyz\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{text}\r\n' for name, text in fields.items()
-    ]
-    body = "".join(parts).encode()
+    head = "--xyz\r\nContent-Disposition: form-data"
+    body = "".join(f'{head}; name="{name}"\r\n\r\n{text}\r\n' for name, text in fields.items()).encode()
     for name, content in (files or {}).items():
         body += f'{head}; name="images"; filename="{name}"\r\n\r\n'.encode() + content + b"\r\n"
     return body + b"--xyz--\r\n"
