@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import random
+import re
 import socket
 import time
 from collections.abc import Mapping, Sequence
@@ -69,7 +70,7 @@ def cut_upload(port: int, path: str, body: bytes, headers: Mapping[str, str], sh
         pass  # the node is just being started again
 
 
-def raw(port: int, data: bytes, wait_s: float = 5.0) -> bytes:
+def raw(port: int, data: bytes, wait_s: float = 0.7) -> bytes:
     """Send bytes, and return what comes back until the connection ends or nothing comes any more."""
     found = b""
     try:
@@ -78,11 +79,18 @@ def raw(port: int, data: bytes, wait_s: float = 5.0) -> bytes:
             connection.settimeout(wait_s)
             while block := connection.recv(1 << 16):
                 found += block
-                if b"\r\n\r\n" in found and b"onnection: close" not in found:
+                if is_whole(found):
                     break
     except OSError:
         pass
     return found
+
+
+def is_whole(answer: bytes) -> bool:
+    """Whether an answer has as many bytes as its head states."""
+    head, end, body = answer.partition(b"\r\n\r\n")
+    length = re.search(rb"content-length: (\d+)", head.lower())
+    return bool(end) and length is not None and len(body) >= int(length[1])
 
 
 class Client:

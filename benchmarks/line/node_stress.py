@@ -315,7 +315,7 @@ def is_refusal(answer: bytes) -> bool:
     if not answer:
         return True
     status = answer.split(b" ", 2)[1:2]
-    return bool(status) and (status[0][:1] in (b"4", b"5") and status[0] != b"500" or b'"error"' in answer)
+    return bool(status) and ((status[0][:1] in (b"4", b"5") and status[0] != b"500") or b'"error"' in answer)
 
 
 def guess_tokens(work: Path, count: int) -> int:
