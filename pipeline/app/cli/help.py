@@ -111,6 +111,12 @@ PAGES = {
         ("view OUT", "view OUT --mark --points control.csv"),
         "docs/viewing.md",
     ),
+    "start": HelpPage(
+        "Opens a page on which a folder of photos is dropped, checked, started and watched; nobody else can use it. "
+        "Keeps everything in FOLDER, by default splatpipe in your home folder. Ctrl-C ends it; work is kept.",
+        ("start", "start ~/surveys --keep 30"),
+        "docs/node.md",
+    ),
     "node": HelpPage(
         "Takes photos over HTTP as NodeODM does, so that WebODM, CloudODM, ClusterODM and PyODM can use it. Keeps "
         "uploads, runs and results in FOLDER, and goes on where it was when it is started again. It listens on this "

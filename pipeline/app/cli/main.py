@@ -15,7 +15,7 @@ from splatpipe.pipeline.app.cli.check import check
 from splatpipe.pipeline.app.cli.edit import OrderedCommand, edit
 from splatpipe.pipeline.app.cli.formats import convert, export
 from splatpipe.pipeline.app.cli.help import with_help
-from splatpipe.pipeline.app.cli.node import node
+from splatpipe.pipeline.app.cli.node import node, start
 from splatpipe.pipeline.app.library.commands import carry_out, run_line, run_one_stage
 from splatpipe.pipeline.app.library.requests import (
     Overrides,
@@ -395,6 +395,7 @@ def doctor(
         print_line(f"! {warning.message} {warning.hint}")
 
 
+with_help(app)(start)
 with_help(app)(node)
 with_help(app)(check)
 with_help(app, cls=OrderedCommand)(edit)

@@ -32,6 +32,35 @@ AllowHostOption = Annotated[
 ]
 
 
+BrowserOption = Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")]
+
+
+def start(
+    folder: Annotated[
+        Path,
+        typer.Argument(callback=expand_user, metavar="[FOLDER]", help="Folder for uploads, runs and results."),
+    ] = Path("~/splatpipe"),
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 for 8473, or another if it is taken.")
+    ] = 0,
+    browser: BrowserOption = True,
+    keep: KeepOption = 0.0,
+) -> None:
+    """Open splatpipe in the browser, on this machine and for you alone: hand in photos, watch runs, open results."""
+    import threading
+    import webbrowser
+
+    from splatpipe.pipeline.app.node.serve import NodeOptions, serve
+    from splatpipe.pipeline.app.terminal.console import print_line
+
+    def opened(address: str) -> None:
+        if browser:
+            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+
+    print_line(f"Photos, runs and results are kept in {folder}.")
+    serve(NodeOptions(folder, port, keep_days=keep, own=True), print_line, opened)
+
+
 def node(
     folder: FolderArgument,
     port: PortOption = 3000,

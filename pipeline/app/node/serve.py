@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import logging
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,16 +13,20 @@ import uvicorn
 from starlette.types import ASGIApp
 
 from splatpipe.pipeline.app.node.api.connection import NodeConnection
-from splatpipe.pipeline.app.node.api.guard import Guard
+from splatpipe.pipeline.app.node.api.guard import PAGES, Guard
 from splatpipe.pipeline.app.node.api.routes import Api, make_app
-from splatpipe.pipeline.app.node.page.routes import OPEN_PATHS, page_routes
+from splatpipe.pipeline.app.node.page.gate import own_token, page_access
+from splatpipe.pipeline.app.node.page.routes import Page
 from splatpipe.pipeline.app.node.tasks.folder_lock import locked_folder
 from splatpipe.pipeline.app.node.tasks.node import Node
 from splatpipe.pipeline.app.node.tasks.settings import Settings
-from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, StopSignal, UsageError
+from splatpipe.pipeline.app.view.access import KEY
+from splatpipe.pipeline.engine.errors import MachineError, StopSignal, UsageError
 from splatpipe.pipeline.engine.machine import available_cores
 
 LOOPBACK, PORT = "127.0.0.1", 3000
+# For one person, if free: marks that a browser has not sent yet belong to an address, which the next server needs, too.
+OWN_PORT = 8473
 LEAST_TOKEN_LETTERS = 16
 BACKLOG = 512
 DRAIN_S = 2  # an upload that is under way at the end is sent again by its client
@@ -39,6 +44,7 @@ class NodeOptions:
         parallel: Runs at once.
         keep_days: Ended tasks are removed after so many days; 0 for never.
         allow_hosts: Hosts that the node may contact for a client.
+        own: Whether it is for one person: only who has its printed address gets in, by a token that nobody knows.
     """
 
     folder: Path
@@ -48,6 +54,7 @@ class NodeOptions:
     parallel: int = 1
     keep_days: float = 0.0
     allow_hosts: tuple[str, ...] = ()
+    own: bool = False
 
 
 def serve(
@@ -58,40 +65,49 @@ def serve(
     Args:
         options: Options of the server.
         print_line: Prints a line for the user.
-        ready: Called with the node's address when it listens.
+        ready: Called when it listens, with the address of its page for a browser of this user.
 
     Raises:
         UsageError: if others could reach the node and it has no token.
         MachineError: if the port is taken, or another node works in the folder.
     """
     check_options(options)
+    logging.getLogger("python_multipart").setLevel(logging.CRITICAL)  # bodies that it cannot read are the client's
     with locked_folder(options.folder):
         threads = max(1, available_cores() // options.parallel)
         settings = Settings(options.folder.resolve(), options.parallel, threads, options.keep_days)
         node = Node(settings, options.allow_hosts, print_line)
-        listening = _listen(options.host, options.port)  # all tasks are known by now: no poll misses one
+        token = own_token(settings.folder) if options.own else options.token
+        access = page_access(settings.folder, token)
+        page = Page(node, access)
+        listening = _listen_as(options)  # all tasks are known by now: no poll misses one
         host = f"[{options.host}]" if ":" in options.host else options.host
         address = f"http://{host}:{listening.getsockname()[1]}/"
 
         def listens() -> None:
             node.start()
+            page.start()
             kept = f"ended tasks are kept {options.keep_days:g} days" if options.keep_days else "tasks are kept"
             print_line(f"Listening on {address}; {kept}. Ctrl-C to stop: what runs goes on at the next start.")
-            ready(address)
+            if options.own or not token:
+                print_line(f"Page: {address}{KEY}{access.keys.key}")
+            else:
+                print_line(f"Page: {address} asks for the token.")
+            ready(f"{address}{KEY}{access.keys.own_key}")
 
         try:
-            _Server(_settings(make_guarded(node, options.token)), listens).run(sockets=[listening])
-        except StopSignal as stopped:
-            if stopped.exit_code != EXIT_INTERRUPTED:
-                raise
+            _Server(_settings(make_guarded(node, page, token, local=options.own)), listens).run(sockets=[listening])
+        except StopSignal:  # Ctrl-C and SIGTERM are the normal ways to end the node
+            print_line("Stopped: what was running goes on at the next start.")
         finally:
             listening.close()
+            page.close()
             node.stop()
 
 
-def make_guarded(node: Node, token: str) -> ASGIApp:
+def make_guarded(node: Node, page: Page, token: str, *, local: bool = False) -> ASGIApp:
     """The application behind its guard."""
-    return Guard(make_app(Api(node), page_routes(node)), token, OPEN_PATHS)
+    return Guard(make_app(Api(node), page.routes()), token, PAGES, local=local)
 
 
 def check_options(options: NodeOptions) -> None:
@@ -146,6 +162,15 @@ def _settings(app: ASGIApp) -> uvicorn.Config:
         timeout_keep_alive=60,
         backlog=BACKLOG,
     )
+
+
+def _listen_as(options: NodeOptions) -> socket.socket:
+    if options.own and options.port == 0:
+        try:
+            return _listen(options.host, OWN_PORT)
+        except MachineError:
+            pass
+    return _listen(options.host, options.port)
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -259,7 +259,9 @@ function showFile() {
   $("file").replaceChildren(
     element("p", {}, "Mark each point in ", wanted),
     element("p", {}, "Marks go into ", element("code", {}, state.overview.file), ` in ${state.overview.crs}.`),
-    element("p", {}, "Then: ", element("code", {}, state.overview.command)),
+    state.overview.command
+      ? element("p", {}, "Then: ", element("code", {}, state.overview.command))
+      : element("p", {}, "Then ", element("a", { href: "run" }, "go back"), " and apply the marks."), // of a node
   );
 }
 

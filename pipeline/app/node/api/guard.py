@@ -22,7 +22,9 @@ from splatpipe.pipeline.app.serving.refusals import HOSTS, RefusedError, check_o
 PATH = re.compile(rb"/(?:\w[\w.~-]*(?:/\w[\w.~-]*)*/?)?", re.ASCII)  # no escapes, no dots first
 MAX_PATH_LETTERS = 400
 MAX_QUERY_LETTERS = 4096
+MAX_HEADER_BYTES = 16 << 10  # of all headers: cookies of other servers on 127.0.0.1 come along
 MAX_PARAMETERS = 32
+VERSIONS = ("1.0", "1.1")
 METHODS = ("GET", "HEAD", "POST", "OPTIONS")
 HEADERS = {
     "x-content-type-options": "nosniff",
@@ -38,6 +40,8 @@ CORS = {
     "access-control-expose-headers": "Content-Length, Content-Range, Accept-Ranges",
     "access-control-max-age": "600",
 }
+PAGES = ("/page/", "/results/")  # of the page, which looks after them itself (page/gate.py)
+SANDBOXED = "/results/"  # a run's own pages have no origin
 OPEN_CALLS = ("/auth/info", "/auth/login", "/auth/register")
 
 
@@ -47,25 +51,35 @@ class Guard:
     Args:
         app: The application behind it.
         token: The token; empty for none.
-        open_paths: Beginnings of paths that need no token: the page's own files, which hold nothing of anybody.
+        open_paths: Beginnings of paths whose requests are checked by who handles them: no token, no Origin, no CORS.
         escaped: Beginnings of paths in which names of files may be escaped.
+        local: Whether only this machine calls it, even with a token, so that Host and Origin are checked.
     """
 
-    def __init__(self, app: ASGIApp, token: str, open_paths: Sequence[str] = (), escaped: Sequence[bytes] = ()) -> None:
-        self._app, self._token = app, token
+    def __init__(
+        self,
+        app: ASGIApp,
+        token: str,
+        open_paths: Sequence[str] = (),
+        escaped: Sequence[bytes] = (),
+        *,
+        local: bool = False,
+    ) -> None:
+        self._app, self._token, self._local = app, token, local or not token
         self._open, self._escaped = tuple(open_paths), tuple(escaped)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        answered = _with_headers(send, HEADERS | (CORS if self._token else {}))
+        has_cors = not self._local and not self._is_open(scope)
+        answered = _with_headers(send, HEADERS | (CORS if has_cors else {}))
         try:
             self._check(scope)
         except RefusedError as error:
             await PlainTextResponse(f"{error}\n", error.status, {"connection": "close"})(scope, receive, answered)
             return
         if scope["method"] == "OPTIONS":
-            await Response(status_code=204 if self._token else 405)(scope, receive, answered)
+            await Response(status_code=204 if has_cors else 405)(scope, receive, answered)
         elif not self._opens(scope):
             await JSONResponse({"error": BAD_TOKEN}, headers={"connection": "close"})(scope, receive, answered)
         else:
@@ -77,12 +91,17 @@ class Guard:
         Raises:
             RefusedError: if it is not allowed.
         """
+        if scope["http_version"] not in VERSIONS:
+            raise RefusedError(505, "Only HTTP/1.0 and HTTP/1.1 are spoken here.")
+        if sum(len(name) + len(value) for name, value in scope["headers"]) > MAX_HEADER_BYTES:
+            raise RefusedError(431, "The headers are too long.")
         host = only_header(scope["headers"], b"host", "Host")
         headers = Headers(scope=scope)
-        if not self._token:
+        if self._local:
             if HOSTS.fullmatch(host) is None:
-                raise RefusedError(421, "This node has no token; it answers to 127.0.0.1 and localhost only.")
-            check_origin(headers)
+                raise RefusedError(421, "This node is for this machine; it answers to 127.0.0.1 and localhost only.")
+            if not scope["path"].startswith(SANDBOXED):
+                check_origin(headers)
         if scope["method"] not in METHODS:
             raise RefusedError(405, "Only GET, HEAD and POST are accepted.")
         path: bytes = scope.get("raw_path") or b""
@@ -95,10 +114,13 @@ class Guard:
         if scope["method"] != "POST" and has_body:
             raise RefusedError(400, "A read request must not have a body.")
 
+    def _is_open(self, scope: Scope) -> bool:
+        """Whether a request is for the page, which checks on its own who sends it."""
+        return scope["path"] == "/" or str(scope["path"]).startswith(self._open)
+
     def _opens(self, scope: Scope) -> bool:
         """Whether a request carries the token, or needs none."""
-        path = scope["path"]
-        if not self._token or path in OPEN_CALLS or path == "/" or path.startswith(self._open or ("\0",)):
+        if not self._token or scope["path"] in OPEN_CALLS or self._is_open(scope):
             return True
         try:
             given = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=MAX_PARAMETERS)

@@ -1,1 +1,1 @@
-"""The node's own page: drop photos, follow runs, open results."""
+"""The page at ``/``: captures are handed in, checked and started in the browser, and results are opened there."""

@@ -55,6 +55,7 @@ class Option:
         domain: What values it takes: a rule in ODM's words, or the choices of an ``enum``.
         help: What it does.
         check: Converts a value of the right type further; raises OptionValueError.
+        listed: Whether ``/options`` has it: only the node's own page knows what to do after the others.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Option:
     domain: str | tuple[str, ...]
     help: str
     check: Callable[[Any], Any] = lambda value: value
+    listed: bool = True
 
     def as_json(self) -> dict[str, Any]:
         """The item of ``/options``: clients take exactly these keys, and only a text as value."""
@@ -107,7 +109,7 @@ def _to_text(value: Any, _domain: object) -> str:
     text = json.dumps(value) if isinstance(value, dict | list) else value
     if not isinstance(text, str):
         text = str(value) if isinstance(value, int | float) else ""
-    if len(text) > MAX_BOUNDARY_CHARACTERS or "\0" in text:
+    if len(text) > MAX_BOUNDARY_CHARACTERS or any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in text):
         raise OptionValueError("is too long, or is no text")
     return text.strip()
 
@@ -278,7 +280,16 @@ CATALOGUE = (
         _duration,
     ),
     Option("sky", "bool", "false", "bool", "Keep the sky as a picture around the splat."),
+    Option(
+        "mark-first",
+        "bool",
+        "false",
+        "bool",
+        "Stop before the training, so that control points can be marked on the node's page.",
+        listed=False,
+    ),
 )
+LISTED = tuple(option for option in CATALOGUE if option.listed)
 BY_NAME = {option.name: option for option in CATALOGUE}
 
 

@@ -11,6 +11,8 @@ from splatpipe.stages.products import CELL_PIXELS, options_for
 DEPTH_MEGAPIXELS = {"ultra": 4.8, "high": 2.4, "medium": 1.2, "low": 0.6, "lowest": 0.3}
 FEATURE_PIXELS = {"ultra": 4000, "high": 2800, "medium": 2000, "low": 1400, "lowest": 1000}
 CM = 0.01
+MARK_FIRST = "mark-first"  # the option with which a run stops where control points can be marked
+MARKED_AFTER = "georef"  # marks are predicted in photos by the georeferenced model
 NOT_TRAINED_UNTIL = "ortho"  # the last stage that an orthophoto needs; training is not among those before it
 
 
@@ -69,10 +71,14 @@ def run_options(given: Mapping[str, Any]) -> RunOptions:
             put("georef", option, given[name])
     if given.get("sky"):
         put("export", "sky", True)
+    if not fast:
+        put("export", "formats", "tiles")
+        formats = [*(["mesh-tiles"] if mesh else []), *(["mbtiles"] if preset != "preview" or "ortho" in asked else [])]
+        put("publish", "formats", ",".join(formats))
     return RunOptions(
         preset,
         tables,
-        NOT_TRAINED_UNTIL if fast else "",
+        MARKED_AFTER if given.get(MARK_FIRST) else NOT_TRAINED_UNTIL if fast else "",
         given.get("time-budget", ""),
         given.get("boundary", ""),
     )
