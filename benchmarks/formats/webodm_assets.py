@@ -207,7 +207,8 @@ def _over_surface(root: Path, points: Array) -> Array:
     if not path.is_file():
         return np.zeros(0)
     with rasterio.open(path) as raster:
-        columns, rows = (~raster.transform) * (points[:, 0], points[:, 1])
+        place = raster.transform
+        columns, rows = (points[:, 0] - place.c) / place.a, (points[:, 1] - place.f) / place.e
         heights = raster.read(1, masked=True).filled(np.nan)
     rows, columns = np.floor(rows).astype(int), np.floor(columns).astype(int)
     inside = (rows >= 0) & (columns >= 0) & (rows < heights.shape[0]) & (columns < heights.shape[1])

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import math
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
-from affine import Affine
+from PIL import Image
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.shutil import copy as copy_raster
+from rasterio.transform import from_bounds
 from rasterio.warp import transform_bounds
 from rasterio.windows import Window
 
@@ -67,6 +70,26 @@ def _gdal(scratch: Path) -> Iterator[None]:
         yield
 
 
+def check_map_tiles(path: Path) -> None:
+    """Open MBTiles, and read a tile.
+
+    Args:
+        path: The file.
+
+    Raises:
+        UnusableRaster: if it cannot be read, or has no picture.
+    """
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as tiles:
+            found = tiles.execute("SELECT tile_data FROM tiles LIMIT 1").fetchone()
+        if found is None:
+            raise UnusableRaster("it has no tiles")
+        with Image.open(io.BytesIO(found[0])) as picture:
+            picture.load()
+    except (sqlite3.Error, OSError, TypeError, Image.DecompressionBombError) as error:
+        raise UnusableRaster(f"it cannot be read: {error}") from error
+
+
 def _is_on_earth(raster: rasterio.DatasetReader) -> bool:
     if not (raster.crs.is_projected or raster.crs.is_geographic):
         return False
@@ -107,7 +130,7 @@ def write_picture(source: Path, target: Path) -> tuple[int, int]:
                 "count": 4,
                 "dtype": "uint8",
             }
-            profile["transform"] = raster.transform @ Affine.scale(raster.width / width, raster.height / height)
+            profile["transform"] = from_bounds(*raster.bounds, width, height)
             layout = {"photometric": "RGB", "alpha": "unspecified", "interleave": "pixel", "compress": "deflate"}
             with rasterio.open(whole, "w", **profile, **layout, zlevel=1) as picture:
                 for row in range(0, height, STRIP_ROWS):
