@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import rasterio
+from affine import Affine
 from PIL import Image
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.shutil import copy as copy_raster
-from rasterio.transform import from_bounds
 from rasterio.warp import transform_bounds
 from rasterio.windows import Window
 
@@ -130,7 +130,8 @@ def write_picture(source: Path, target: Path) -> tuple[int, int]:
                 "count": 4,
                 "dtype": "uint8",
             }
-            profile["transform"] = from_bounds(*raster.bounds, width, height)
+            left, bottom, right, top = raster.bounds
+            profile["transform"] = Affine((right - left) / width, 0.0, left, 0.0, (bottom - top) / height, top)
             layout = {"photometric": "RGB", "alpha": "unspecified", "interleave": "pixel", "compress": "deflate"}
             with rasterio.open(whole, "w", **profile, **layout, zlevel=1) as picture:
                 for row in range(0, height, STRIP_ROWS):
