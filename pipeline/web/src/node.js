@@ -110,7 +110,7 @@ async function take(files, into = null) {
 async function begin(found, into) {
   const { photos, files, title, others } = found;
   if (!photos.length) {
-    const only = others.length ? ` Its ${count(others.length, "file")} are of other kinds.` : "";
+    const only = others.length ? ` It has ${count(others.length, "file")} of other kinds.` : "";
     throw new UnfitDropError(`There are no photos in this.${only} Photos are ${node.accepts.photos.join(", ")}.`);
   }
   const bytes = files.reduce((sum, { file }) => sum + file.size, 0);
