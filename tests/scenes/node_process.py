@@ -36,9 +36,8 @@ class StartedNode:
 def started(folder: Path, *options: object) -> Iterator[StartedNode]:
     """Run ``splatpipe start FOLDER`` while the context lasts."""
     command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "start", str(folder), "--no-browser"]
-    process = subprocess.Popen(
-        [*command, *map(str, options)], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
+    command += map(str, options)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     try:
         assert process.stderr is not None
         output = ""

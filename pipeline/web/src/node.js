@@ -35,9 +35,8 @@ const page = {
 
   start: (card) => attempt(card, async () => {
     if (invalid(card)) return;
-    const name = card.form().name?.value.trim() || card.task.name;
     const options = card.form().values();
-    await postJson(`api/start/${card.uuid}`, { name, options, pause: card.pause?.checked === true });
+    await postJson(`api/start/${card.uuid}`, { name: card.name, options, pause: card.pause?.checked === true });
     card.upload = null;
     card.heading.focus();
   }),

@@ -40,7 +40,7 @@ export class OptionsForm {
       const place = this.forecasts.get(each.preset);
       if (!place) continue;
       place.replaceChildren(`about ${roughly(each.seconds)}, ${size(each.memory_bytes)} of memory, ${size(each.disk_bytes)} of disk`);
-      if (each.lacking) place.append(element("strong", { class: "lacking" }, ` This machine lacks ${each.lacking}.`));
+      if (each.lacking) place.append(element("strong", { class: "lacking" }, ` It needs ${each.lacking}.`));
     }
   }
 
