@@ -44,6 +44,10 @@ class OpenFile:
     size: int
     tag: str
 
+    def read(self, length: int, at: int) -> bytes:
+        """Bytes from an offset on, at most so many; none at the end of the file only."""
+        return os.pread(self.descriptor, length, at)
+
 
 def open_inside(folder: Path, relative: str) -> OpenFile:
     """Open a regular file below a folder; symbolic links anywhere in the path are rejected.
@@ -145,7 +149,7 @@ class FileAnswer(Response):
         await send({"type": "http.response.start", "status": status, "headers": self.raw_headers})
         if request.method != "HEAD":
             while begin < end:
-                chunk = await to_thread.run_sync(os.pread, self._file.descriptor, min(CHUNK_BYTES, end - begin), begin)
+                chunk = await to_thread.run_sync(self._file.read, min(CHUNK_BYTES, end - begin), begin)
                 if not chunk:
                     raise OSError("the file became shorter while it was sent")
                 begin += len(chunk)

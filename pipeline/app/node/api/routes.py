@@ -19,7 +19,7 @@ from splatpipe.pipeline.app.node.api.answers import DISK_FULL, SUCCESS, answer, 
 from splatpipe.pipeline.app.node.api.bodies import drain, limited, small_body
 from splatpipe.pipeline.app.node.api.multipart import BadBodyError, Form, read_form
 from splatpipe.pipeline.app.node.api.received import UploadedFile, refuse_files
-from splatpipe.pipeline.app.node.assets.names import asset_path
+from splatpipe.pipeline.app.node.assets.single import is_asset, media_type, open_asset
 from splatpipe.pipeline.app.node.tasks.disk import free_bytes
 from splatpipe.pipeline.app.node.tasks.log import from_line
 from splatpipe.pipeline.app.node.tasks.names import BadNameError
@@ -30,7 +30,7 @@ from splatpipe.pipeline.app.node.tasks.scheduler import RefusedTaskError
 from splatpipe.pipeline.app.node.tasks.settings import MAX_FILES, MAX_TASK_BYTES
 from splatpipe.pipeline.app.node.tasks.store import UnknownTaskError
 from splatpipe.pipeline.app.node.tasks.uploads import NameTakenError
-from splatpipe.pipeline.app.serving.files import FileAnswer, FileNotServedError, open_inside
+from splatpipe.pipeline.app.serving.files import FileAnswer, FileNotServedError
 from splatpipe.pipeline.engine.files.json_file import parse_json
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
 
@@ -39,15 +39,6 @@ ENGINE = "splatpipe"
 MAX_ENGINE_LETTERS = 32
 MAX_INIT_BYTES = 8 << 20
 MAX_IGNORED_BYTES = 1 << 20
-TYPES = {
-    ".zip": "application/zip",
-    ".pdf": "application/pdf",
-    ".json": "application/json",
-    ".geojson": "application/geo+json",
-    ".tif": "image/tiff",
-    ".glb": "model/gltf-binary",
-    ".txt": "text/plain; charset=utf-8",
-}
 REFUSALS = (RefusedTaskError, OutgoingError, BadBodyError, BadNameError, NameTakenError)
 
 
@@ -197,22 +188,19 @@ class Api:
 
     async def download(self, request: Request) -> Response:
         """A file of a task's results."""
-        uuid = _uuid(request)
-        path = asset_path(request.path_params["asset"])
-        if path is None:
+        uuid, name = _uuid(request), request.path_params["asset"]
+        if not is_asset(name):
             return error_answer("Invalid asset")
         try:
             folder = self.node.results(uuid)
             if folder is None:
                 return error_answer("Asset not ready")
-            file = await to_thread.run_sync(open_inside, folder, path)
+            file = await to_thread.run_sync(open_asset, folder, name)
         except UnknownTaskError:
             return error_answer(f"{uuid[:60]} not found")
         except FileNotServedError:
             return error_answer("Invalid asset")
-        name = path.rpartition("/")[2]
-        kind = TYPES.get(name[name.rfind(".") :], "application/octet-stream")
-        return FileAnswer(file, kind, {"content-disposition": f'attachment; filename="{name}"'})
+        return FileAnswer(file, media_type(name), {"content-disposition": f'attachment; filename="{name}"'})
 
     async def cancel(self, request: Request) -> Response:
         """Cancel a task."""

@@ -1,1 +1,1 @@
-"""What a client downloads of a finished run: files by fixed names, and all.zip."""
+"""What a node hands back of a finished run: `all.zip` in the layout that ODM's clients know, and single files of it."""
