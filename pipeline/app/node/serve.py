@@ -20,7 +20,7 @@ from splatpipe.pipeline.app.node.tasks.folder_lock import locked_folder
 from splatpipe.pipeline.app.node.tasks.node import Node
 from splatpipe.pipeline.app.node.tasks.settings import Settings
 from splatpipe.pipeline.app.view.access import KEY
-from splatpipe.pipeline.engine.errors import EXIT_INTERRUPTED, MachineError, StopSignal, UsageError
+from splatpipe.pipeline.engine.errors import MachineError, StopSignal, UsageError
 from splatpipe.pipeline.engine.machine import available_cores
 
 LOOPBACK, PORT = "127.0.0.1", 3000
@@ -95,9 +95,8 @@ def serve(
 
         try:
             _Server(_settings(make_guarded(node, page, token, local=options.own)), listens).run(sockets=[listening])
-        except StopSignal as stopped:
-            if stopped.exit_code != EXIT_INTERRUPTED:
-                raise
+        except StopSignal:  # Ctrl-C and SIGTERM are the normal ways to end the node
+            print_line("Stopped: what was running goes on at the next start.")
         finally:
             listening.close()
             page.close()

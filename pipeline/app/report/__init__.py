@@ -6,6 +6,7 @@ there can neither fail a good run nor delay its end, and the command need not lo
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -92,7 +93,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
         MachineError: if it could not be written.
     """
     hurry = [] if until_s is None else ["--hurry"]
-    command = python_module("splatpipe.pipeline.app.report", str(out), *hurry)
+    command = python_module("splatpipe.pipeline.app.report", str(out), str(os.getpid()), *hurry)
     path = out / REPORT_FILE
     before = _stamp(path)
     began_s = time.monotonic()

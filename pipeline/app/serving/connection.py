@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
+from typing import Protocol, TypeVar
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -78,7 +79,22 @@ class Connection(H11Protocol):
             self._timer = None
 
 
-def longest_waiting(waiting: list[Connection]) -> Connection:
+class Waiting(Protocol):
+    """A connection that waits for a request."""
+
+    @property
+    def peer(self) -> str:
+        """The client's address."""
+
+    @property
+    def since_s(self) -> float:
+        """When it began to wait."""
+
+
+Kind = TypeVar("Kind", bound=Waiting)
+
+
+def longest_waiting(waiting: list[Kind]) -> Kind:
     """The connection to close: of the address that has most of them, the one that has waited longest."""
     crowd = Counter(connection.peer for connection in waiting).most_common(1)[0][0]
     return min((connection for connection in waiting if connection.peer == crowd), key=lambda each: each.since_s)

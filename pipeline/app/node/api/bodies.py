@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qsl
 
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 
 from splatpipe.pipeline.app.node.api.multipart import BadBodyError
 from splatpipe.pipeline.engine.files.json_file import parse_json
 
 MAX_SMALL_BYTES = 4 << 20  # options with a boundary, urlencoded
 MAX_FIELDS = 32
+MAX_REST_BYTES = 32 << 20  # read of a refused body, so that its client gets to read why
+WHOLE = "splatpipe.whole"  # whether a request's body has been read to its end
 
 
 async def limited(request: Request, max_bytes: int) -> AsyncIterator[bytes]:
@@ -22,15 +25,19 @@ async def limited(request: Request, max_bytes: int) -> AsyncIterator[bytes]:
         BadBodyError: if it has more bytes, or ends too early.
     """
     size = 0
-    try:
-        async for chunk in request.stream():
-            size += len(chunk)
-            if size > max_bytes:
-                raise BadBodyError("The request is too large.")
-            if chunk:
-                yield chunk
-    except ClientDisconnect as error:
-        raise BadBodyError("The request ended too early.") from error
+    while True:
+        message = await request.receive()
+        if message["type"] != "http.request":
+            raise BadBodyError("The request ended too early.")
+        request.scope[WHOLE] = not message.get("more_body", False)
+        chunk = message.get("body", b"")
+        size += len(chunk)
+        if size > max_bytes:
+            raise BadBodyError("The request is too large.")
+        if chunk:
+            yield chunk
+        if request.scope[WHOLE]:
+            return
 
 
 async def small_body(request: Request) -> dict[str, Any]:
@@ -51,6 +58,14 @@ async def small_body(request: Request) -> dict[str, Any]:
         return dict(parse_qsl(data.decode(), keep_blank_values=True, max_num_fields=MAX_FIELDS))
     except (ValueError, UnicodeError) as error:
         raise BadBodyError("The request is neither JSON nor urlencoded.") from error
+
+
+async def drain_rest(request: Request) -> None:
+    """Read what is left of a refused body, within limits; beyond, its connection is closed."""
+    has_body = "transfer-encoding" in request.headers or request.headers.get("content-length", "0") != "0"
+    if has_body and not request.scope.get(WHOLE):
+        with suppress(BadBodyError):
+            await drain(request, MAX_REST_BYTES)
 
 
 async def drain(request: Request, max_bytes: int) -> None:

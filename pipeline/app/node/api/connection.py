@@ -12,11 +12,12 @@ import asyncio
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from splatpipe.pipeline.app.serving.connection import longest_waiting
+
 HEAD_S = 20.0  # for a request's head; also how long an idle connection is kept
 PERIOD_S = 30.0
 LEAST_BYTES = 8 << 10  # of a body in each period: a line of 3 kbit/s
 MAX_CONNECTIONS = 512  # 30 clients with ten threads, and room for polls
-MAX_FROM_ONE = 256  # of one address
 
 
 class NodeConnection(H11Protocol):
@@ -24,6 +25,7 @@ class NodeConnection(H11Protocol):
 
     _timer: asyncio.TimerHandle | None = None
     _period_bytes = 0
+    _unread = 0  # bytes of the answer that wait for the client
     since_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -31,12 +33,9 @@ class NodeConnection(H11Protocol):
         super().connection_made(transport)
         self.since_s = self.loop.time()
         self._watch()
-        others = [each for each in self.connections if isinstance(each, NodeConnection)]
-        own = [each for each in others if each.peer == self.peer]
-        crowd = own if len(own) > MAX_FROM_ONE else others if len(others) > MAX_CONNECTIONS else []
-        if crowd:
-            idle = [each for each in crowd if each.is_waiting and each is not self]
-            (min(idle, key=lambda each: each.since_s) if idle else self).transport.close()
+        if len(self.connections) > MAX_CONNECTIONS:
+            waiting = [each for each in self.connections if isinstance(each, NodeConnection) and each.is_waiting]
+            longest_waiting(waiting or [self]).transport.close()
 
     def data_received(self, data: bytes) -> None:
         """Process what the client sent."""
@@ -74,11 +73,12 @@ class NodeConnection(H11Protocol):
     def _check(self) -> None:
         """Close a connection that does not move; called at the end of each period."""
         state = self.conn.their_state
-        stuck = state is h11.IDLE
+        unread = self.transport.get_write_buffer_size() if self.flow.write_paused else 0
+        stuck = state is h11.IDLE or (unread and unread == self._unread)
         if state is h11.SEND_BODY and not self.flow.read_paused:
             stuck = self._period_bytes < LEAST_BYTES
         if stuck:
-            self.transport.close()
+            self.transport.abort()
             return
-        self._period_bytes = 0
+        self._period_bytes, self._unread = 0, unread
         self._timer = self.loop.call_later(PERIOD_S, self._check)

@@ -49,7 +49,7 @@ class Guard:
     Args:
         app: The application behind it.
         token: The token; empty for none.
-        open_paths: Beginnings of paths that need no token: the page's own files, which hold nothing of anybody.
+        open_paths: Beginnings of paths whose requests are checked by who handles them: no token, no Origin, no CORS.
         escaped: Beginnings of paths in which names of files may be escaped.
         local: Whether only this machine calls it, even with a token, so that Host and Origin are checked.
     """
@@ -69,14 +69,15 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        answered = _with_headers(send, HEADERS | ({} if self._local else CORS))
+        has_cors = not self._local and not self._is_open(scope)
+        answered = _with_headers(send, HEADERS | (CORS if has_cors else {}))
         try:
             self._check(scope)
         except RefusedError as error:
             await PlainTextResponse(f"{error}\n", error.status, {"connection": "close"})(scope, receive, answered)
             return
         if scope["method"] == "OPTIONS":
-            await Response(status_code=405 if self._local else 204)(scope, receive, answered)
+            await Response(status_code=204 if has_cors else 405)(scope, receive, answered)
         elif not self._opens(scope):
             await JSONResponse({"error": BAD_TOKEN}, headers={"connection": "close"})(scope, receive, answered)
         else:
@@ -107,10 +108,13 @@ class Guard:
         if scope["method"] != "POST" and has_body:
             raise RefusedError(400, "A read request must not have a body.")
 
+    def _is_open(self, scope: Scope) -> bool:
+        """Whether a request is for the page, which checks on its own who sends it."""
+        return scope["path"] == "/" or str(scope["path"]).startswith(self._open)
+
     def _opens(self, scope: Scope) -> bool:
         """Whether a request carries the token, or needs none."""
-        path = scope["path"]
-        if not self._token or path in OPEN_CALLS or path == "/" or path.startswith(self._open or ("\0",)):
+        if not self._token or scope["path"] in OPEN_CALLS or self._is_open(scope):
             return True
         try:
             given = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=MAX_PARAMETERS)

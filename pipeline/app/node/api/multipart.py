@@ -19,6 +19,8 @@ MAX_FIELDS = 32
 MAX_HEADERS = 8
 MAX_HEADER_BYTES = 4096
 BLOCK_BYTES = 1 << 20  # collected before it is written, so that a thread is woken once a megabyte
+LEAST_BLOCK_BYTES = 64 << 10
+BLOCKS_BYTES = 32 << 20  # of all bodies that are received at once
 
 
 class BadBodyError(ValueError):
@@ -78,7 +80,14 @@ def boundary_of(content_type: str) -> str:
     return boundary
 
 
-async def read_form(content_type: str, body: AsyncIterator[bytes], open_file: Opener, run: Run) -> Form:
+def block_bytes(bodies: int) -> int:
+    """How much of each body is collected before it is written, if so many are received at once."""
+    return max(LEAST_BLOCK_BYTES, min(BLOCK_BYTES, BLOCKS_BYTES // max(1, bodies)))
+
+
+async def read_form(
+    content_type: str, body: AsyncIterator[bytes], open_file: Opener, run: Run, block_size: int = BLOCK_BYTES
+) -> Form:
     """Read a body.
 
     Args:
@@ -86,6 +95,7 @@ async def read_form(content_type: str, body: AsyncIterator[bytes], open_file: Op
         body: Its bytes.
         open_file: Called with a file's name and the fields before it; runs in a thread.
         run: Runs a function in a thread.
+        block_size: How much of a file is collected before it is written.
 
     Raises:
         BadBodyError: if it cannot be parsed, ends too early, or has too many or too large fields.
@@ -100,7 +110,7 @@ async def read_form(content_type: str, body: AsyncIterator[bytes], open_file: Op
                     receiver = await run(open_file, part.file_name, form.fields)
                 elif kind == "data" and receiver is not None:
                     block += data
-                    if len(block) >= BLOCK_BYTES:
+                    if len(block) >= block_size:
                         full, block = bytes(block), bytearray()
                         await run(receiver.write, full)  # type: ignore[attr-defined]
                 elif kind == "data":

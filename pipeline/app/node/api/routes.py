@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -16,22 +17,22 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from splatpipe.pipeline.app.node.api.answers import DISK_FULL, SUCCESS, answer, error_answer, failure, option_errors
-from splatpipe.pipeline.app.node.api.bodies import drain, limited, small_body
-from splatpipe.pipeline.app.node.api.multipart import BadBodyError, Form, read_form
+from splatpipe.pipeline.app.node.api.bodies import drain, drain_rest, limited, small_body
+from splatpipe.pipeline.app.node.api.multipart import BadBodyError, Form, block_bytes, read_form
 from splatpipe.pipeline.app.node.api.received import UploadedFile, refuse_files
+from splatpipe.pipeline.app.node.assets.outputs import parse_outputs
 from splatpipe.pipeline.app.node.assets.single import is_asset, media_type, open_asset
 from splatpipe.pipeline.app.node.tasks.disk import free_bytes
-from splatpipe.pipeline.app.node.tasks.log import from_line
 from splatpipe.pipeline.app.node.tasks.names import BadNameError
-from splatpipe.pipeline.app.node.tasks.node import NewTask, Node, parse_outputs
+from splatpipe.pipeline.app.node.tasks.node import NewTask, Node
 from splatpipe.pipeline.app.node.tasks.options import LISTED, WrongOptionsError, parse_options
 from splatpipe.pipeline.app.node.tasks.outgoing import OutgoingError
 from splatpipe.pipeline.app.node.tasks.scheduler import RefusedTaskError
 from splatpipe.pipeline.app.node.tasks.settings import MAX_FILES, MAX_TASK_BYTES
 from splatpipe.pipeline.app.node.tasks.store import UnknownTaskError
-from splatpipe.pipeline.app.node.tasks.uploads import NameTakenError
+from splatpipe.pipeline.app.node.tasks.uploads import ClosedUploadError, NameTakenError
 from splatpipe.pipeline.app.serving.files import FileAnswer, FileNotServedError
-from splatpipe.pipeline.engine.files.json_file import parse_json
+from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes
 
 API_VERSION = "2.2.4"
@@ -39,7 +40,8 @@ ENGINE = "splatpipe"
 MAX_ENGINE_LETTERS = 32
 MAX_INIT_BYTES = 8 << 20
 MAX_IGNORED_BYTES = 1 << 20
-REFUSALS = (RefusedTaskError, OutgoingError, BadBodyError, BadNameError, NameTakenError)
+REFUSALS = (RefusedTaskError, OutgoingError, BadBodyError, BadNameError, NameTakenError, SplatpipeError)
+COMMANDS_AT_ONCE = 16  # cancellations and removals wait for the end of a run, and must not keep uploads from a thread
 
 
 class Api:
@@ -47,10 +49,14 @@ class Api:
 
     Args:
         node: The node.
+        folders: Whether uploaded files keep their folders, for our own page.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, *, folders: bool = False) -> None:
         self.node = node
+        self._folders = folders
+        self._commands = CapacityLimiter(COMMANDS_AT_ONCE)
+        self._receiving = 0  # bodies that are received now
 
     def routes(self) -> list[BaseRoute]:
         """The routes."""
@@ -116,7 +122,10 @@ class Api:
 
     async def init(self, request: Request) -> Response:
         """Begin a task."""
-        form = await self._form(request, MAX_INIT_BYTES, refuse_files) if _has_form(request) else Form()
+        if _has_form(request):
+            form = await self._form(request, MAX_INIT_BYTES, refuse_files)
+        else:
+            form = Form({name: str(value) for name, value in (await small_body(request)).items()})
         wanted = _new_task(form.fields, request.headers.get("set-uuid", ""))
         task = await to_thread.run_sync(self.node.create, wanted)
         return answer({"uuid": task.uuid})
@@ -126,9 +135,10 @@ class Api:
         uuid = _uuid(request)
         try:
             self.node.tasks.get(uuid)
-            opener = partial(UploadedFile.begin, self.node, uuid)
-            form = await self._form(request, MAX_TASK_BYTES, opener)
-        except UnknownTaskError:
+            self._require_disk(request)
+            form = await self._form(request, MAX_TASK_BYTES, self._opener(uuid))
+        except (UnknownTaskError, ClosedUploadError):
+            await drain_rest(request)
             return error_answer("Invalid uuid (not found)", no_retry=True)
         if not form.files:
             return error_answer("Need at least 1 file.", no_retry=True)
@@ -147,10 +157,11 @@ class Api:
     async def new(self, request: Request) -> Response:
         """A whole task in one request."""
         set_uuid = request.headers.get("set-uuid", "")
+        self._require_disk(request)
         task = await to_thread.run_sync(self.node.create, NewTask(uuid=set_uuid))
         try:
             if _has_form(request):
-                form = await self._form(request, MAX_TASK_BYTES, partial(UploadedFile.begin, self.node, task.uuid))
+                form = await self._form(request, MAX_TASK_BYTES, self._opener(task.uuid))
             else:
                 form = Form({name: str(value) for name, value in (await small_body(request)).items()})
             wanted = _new_task(form.fields, "")
@@ -169,11 +180,10 @@ class Api:
             task = self.node.committed(uuid)
             found = self.node.info(task)
         except UnknownTaskError:
-            return error_answer(f"{uuid[:60]} not found")
+            return error_answer(f"{shown(uuid)} not found")
         line = request.query_params.get("with_output")
         if line is not None:
-            lines = await to_thread.run_sync(self.node.lines, task)
-            found["output"] = from_line(lines, _number(line))
+            found["output"] = await to_thread.run_sync(self.node.lines, task, _number(line))
         return answer(found)
 
     async def output(self, request: Request) -> Response:
@@ -182,9 +192,9 @@ class Api:
         try:
             task = self.node.committed(uuid)
         except UnknownTaskError:
-            return error_answer(f"{uuid[:60]} not found")
-        lines = await to_thread.run_sync(self.node.lines, task)
-        return answer(from_line(lines, _number(request.query_params.get("line", "0"))))
+            return error_answer(f"{shown(uuid)} not found")
+        line = _number(request.query_params.get("line", "0"))
+        return answer(await to_thread.run_sync(self.node.lines, task, line))
 
     async def download(self, request: Request) -> Response:
         """A file of a task's results."""
@@ -197,7 +207,7 @@ class Api:
                 return error_answer("Asset not ready")
             file = await to_thread.run_sync(open_asset, folder, name)
         except UnknownTaskError:
-            return error_answer(f"{uuid[:60]} not found")
+            return error_answer(f"{shown(uuid)} not found")
         except FileNotServedError:
             return error_answer("Invalid asset")
         return FileAnswer(file, media_type(name), {"content-disposition": f'attachment; filename="{name}"'})
@@ -216,9 +226,9 @@ class Api:
         def restart(uuid: str, body: Mapping[str, Any]) -> object:
             options = body.get("options")
             if options is None or options == "":
-                return self.node.scheduler.restart(uuid, None)
+                return self.node.restart(uuid, None)
             given = parse_options(options if isinstance(options, str) else _as_text(options))
-            return self.node.scheduler.restart(uuid, given.values, given.dropped)
+            return self.node.restart(uuid, given)
 
         return await self._command(request, restart)
 
@@ -230,19 +240,32 @@ class Api:
         uuid = uuid.lower()
         try:
             self.node.committed(uuid)
-            await to_thread.run_sync(do, uuid, body)
+            await to_thread.run_sync(do, uuid, body, limiter=self._commands)
         except UnknownTaskError:
-            return failure(f"{uuid[:60]} not found")
+            return failure(f"{shown(uuid)} not found")
         except (RefusedTaskError, WrongOptionsError) as error:
             return failure(_said(error))
         except OSError:
             return failure(DISK_FULL)
         return answer(SUCCESS)
 
+    def _opener(self, uuid: str) -> partial[UploadedFile]:
+        return partial(UploadedFile.begin, self.node, uuid, self._folders)
+
+    def _require_disk(self, request: Request) -> None:
+        """Refuse a body for which there is no disk before it is sent; one of unknown length is seen as it comes."""
+        length = request.headers.get("content-length", "")
+        if length.isascii() and length.isdecimal() and len(length) < 20:
+            self.node.reserve(int(length))
+
     async def _form(self, request: Request, max_bytes: int, open_file: Any) -> Form:
         body = limited(request, max_bytes)
         kind = request.headers.get("content-type", "")
-        return await read_form(kind, body, open_file, to_thread.run_sync)
+        self._receiving += 1
+        try:
+            return await read_form(kind, body, open_file, to_thread.run_sync, block_bytes(self._receiving))
+        finally:
+            self._receiving -= 1
 
 
 def make_app(api: Api, further: list[BaseRoute]) -> Starlette:
@@ -264,18 +287,25 @@ def _no_route(_request: Request, error: Exception) -> Response:
     return JSONResponse({"error": error.detail}, error.status_code)
 
 
-def _disk_trouble(_request: Request, _error: Exception) -> Response:
+async def _disk_trouble(request: Request, _error: Exception) -> Response:
+    await drain_rest(request)
     return error_answer(DISK_FULL)
 
 
-def _refused(_request: Request, error: Exception) -> Response:
-    response = error_answer(_said(error))
-    response.headers["connection"] = "close"  # the rest of the body is not read
-    return response
+async def _refused(request: Request, error: Exception) -> Response:
+    await drain_rest(request)
+    return error_answer(_said(error))
 
 
 def _said(error: Exception) -> str:
+    if isinstance(error, SplatpipeError):
+        return f"{error.message} {error.hint}".strip()
     return option_errors(error.errors) if isinstance(error, WrongOptionsError) else str(error)
+
+
+def shown(text: str) -> str:
+    """A text of a client's as part of an answer."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text[:60])
 
 
 def _has_form(request: Request) -> bool:
@@ -294,8 +324,6 @@ def _number(text: str) -> int:
 
 
 def _as_text(value: Any) -> str:
-    import json
-
     return json.dumps(value)
 
 
@@ -303,22 +331,16 @@ def _new_task(fields: Mapping[str, str], uuid: str) -> NewTask:
     """What a client asks for with the fields of a form.
 
     Raises:
-        RefusedTaskError: if it cannot be done.
+        UsageError: if outputs are wrong.
         WrongOptionsError: if options have wrong values.
     """
-    outputs: tuple[str, ...] = ()
-    if fields.get("outputs", "").strip():
-        try:
-            outputs = parse_outputs(parse_json(fields["outputs"].encode()))
-        except (ValueError, UnicodeError) as error:
-            raise RefusedTaskError(str(error)) from error
     created = fields.get("dateCreated", "")
     return NewTask(
         fields.get("name", ""),
         parse_options(fields.get("options")),
         fields.get("webhook", ""),
         fields.get("zipurl", ""),
-        outputs,
+        parse_outputs(fields.get("outputs", "")),
         int(created) if created.isascii() and created.isdecimal() and len(created) < 15 else 0,
         uuid,
     )

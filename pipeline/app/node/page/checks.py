@@ -71,7 +71,8 @@ class Checks:
         if self.result(upload, folder) is not None:
             return
         with self._lock:
-            known = {each[0]: each[1].key for each in [*self._waiting, *([self._running] if self._running else [])]}
+            known = {each[0]: each[1].key for each in self._waiting}
+            known |= {} if self._running is None else {self._running[0]: self._running[1].key}
             if known.get(uuid) == upload.key:
                 return
             self._waiting = deque(each for each in self._waiting if each[0] != uuid)

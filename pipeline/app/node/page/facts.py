@@ -82,7 +82,8 @@ class Facts:
         shown = [*alive, *[task for task in tasks if task.has_ended][: max(0, MOST_TASKS - len(alive))]]
         statuses = {task.uuid: self._scheduler.status(task.uuid) for task in shown if task.is_committed}
         places = self._places(shown, statuses)
-        listed = [self.task(task, statuses.get(task.uuid), places.get(task.uuid)) for task in shown]
+        starts = self._scheduler.start_times()
+        listed = [self.task(task, statuses.get(task.uuid), places.get(task.uuid), starts) for task in shown]
         order = {"running": 0, "marks": 1, "waiting": 2}
         listed.sort(key=lambda each: (order.get(each["state"], 0), each["place"] or 0))
         return {
@@ -118,8 +119,11 @@ class Facts:
         found = next((name for name in sorted(names) if name.casefold() in CONTROL_NAMES), None)
         return found or control_file(names)
 
-    def task(self, task: Task, status: TaskStatus | None, place: int | None = None) -> dict[str, Any]:
+    def task(
+        self, task: Task, status: TaskStatus | None, place: int | None = None, starts: Mapping[str, float] | None = None
+    ) -> dict[str, Any]:
         """A task."""
+        starts = starts or {}
         files, state = self.files(task), state_of(task, status)
         facts: dict[str, Any] = {
             "uuid": task.uuid,
@@ -137,7 +141,11 @@ class Facts:
             return facts | {"check": self._check(task)}
         assert status is not None
         facts |= {"progress": round(status.progress, 1), "stage": status.stage, "what": status.what}
-        facts |= {"left_s": round(status.left_s), "why": status.waiting, "starts_in_s": round(status.starts_in_s)}
+        facts |= {
+            "left_s": round(status.left_s),
+            "why": status.waiting,
+            "starts_in_s": round(starts.get(task.job, 0.0)),
+        }
         facts |= {"message": self._without_paths(status.error, task.job)}
         if task.has_ended:
             facts |= {"ended_ms": task.ended_ms, "seconds": status.processing_ms / 1000.0}

@@ -180,7 +180,7 @@ class Page:
         if not (length.isascii() and length.isdigit()):
             raise HTTPException(411, "Content-Length is required.")
         await to_thread.run_sync(self._node.reserve, int(length))
-        file = await to_thread.run_sync(UploadedFile.begin, self._node, uuid, name, {})
+        file = await to_thread.run_sync(UploadedFile.begin, self._node, uuid, True, name, {})
         block = bytearray()
         try:
             async for chunk in limited(request, self._node.limit_of(name)):
@@ -236,7 +236,7 @@ class Page:
             control = self._facts.control(task)
             if control is not None:  # the page for marking has changed it where it lies
                 self._tasks.uploads(task.uuid).forget(control)
-            self._scheduler.restart(task.uuid, values)
+            self._node.restart(task.uuid, GivenOptions(values, task.dropped))
 
         await to_thread.run_sync(restart)
         return JSONResponse({"success": True})

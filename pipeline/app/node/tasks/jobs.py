@@ -6,7 +6,7 @@ FOLDER/jobs/KEY/boundary.geojson  the boundary given as an option
 FOLDER/jobs/KEY/options.toml      the options of the run
 FOLDER/jobs/KEY/out/              the run's OUT
 FOLDER/jobs/KEY/output.txt        what the run printed
-FOLDER/jobs/KEY/assets/           what clients download
+FOLDER/jobs/KEY/assets/all.zip    what clients download, whole or in parts
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from splatpipe.pipeline.app.node.tasks.uploads import PART, FileFacts
+from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.engine.files.durable import remove_unfinished, sync_folder, write_durably
 from splatpipe.pipeline.engine.files.json_file import json_text, read_json
 from splatpipe.pipeline.engine.files.output_file import own_folder, token
@@ -223,6 +224,10 @@ class JobStore:
         """The file of what its run prints."""
         return self.path(key) / "output.txt"
 
+    def labels(self, key: str) -> PathLabels:
+        """Removes the node's folders from what is told of a job."""
+        return PathLabels.of(self.out(key), self.photos(key))
+
 
 def link_files(names: Iterable[str], source: Path, target: Path) -> None:
     """Put files into another folder by hard links, or by copies where the file system has none; what is there stays.
@@ -238,6 +243,7 @@ def link_files(names: Iterable[str], source: Path, target: Path) -> None:
     target.mkdir(exist_ok=True)
     for name in names:
         if not (target / name).exists():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
             link_file(source / name, target / name)
 
 

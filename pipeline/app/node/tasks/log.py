@@ -25,11 +25,6 @@ def log_lines(notes: Sequence[str], output: Path) -> list[str]:
     return [*notes, *(f"{line}." if line.strip() == WORD else line.rstrip() for line in text.splitlines())]
 
 
-def from_line(lines: Sequence[str], line: int) -> list[str]:
-    """The lines from one on; a negative number counts from the end."""
-    return list(lines[line:])
-
-
 def last_line(output: Path) -> str:
     """The last line that says something; empty if there is none."""
     lines = [line for line in log_lines((), output) if line.strip()]

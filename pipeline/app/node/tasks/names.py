@@ -11,6 +11,7 @@ from splatpipe.pipeline.photos.files.names import is_photo, is_plain
 
 Kind = Literal["photo", "film", "survey", "other"]
 
+MAX_FOLDERS = 4  # above a file
 MAX_NAME_BYTES = 240  # file systems take 255; part files have a longer name
 RAW_SUFFIXES = (".dng", ".heic", ".heif")
 SURVEY_SUFFIXES = (".txt", ".csv", ".geojson", ".xml", ".cam", SUBTITLE_SUFFIX)
@@ -30,20 +31,35 @@ def plain_name(given: str) -> str:
     Raises:
         BadNameError: if it is empty, hidden, too long, or has characters that do not fit into a line of a file.
     """
-    name = given.replace("\\", "/").rpartition("/")[2]
+    return _checked(given.replace("\\", "/").rpartition("/")[2])
+
+
+def name_with_folders(given: str) -> str:
+    """The name of an uploaded file with its folders, as a relative POSIX path.
+
+    Raises:
+        BadNameError: if one of them is not a name, or there are too many.
+    """
+    parts = given.replace("\\", "/").split("/")
+    if len(parts) > MAX_FOLDERS + 1:
+        raise BadNameError(f"A file lies below more than {MAX_FOLDERS} folders.")
+    return "/".join(map(_checked, parts))
+
+
+def _checked(name: str) -> str:
     shown = "".join(letter if letter.isprintable() else "?" for letter in name[:60])
     if not name or name.startswith("."):
         raise BadNameError(f'"{shown}" is not a name for a file: it is empty or begins with a dot.')
-    if not is_plain(name) or "\udc80" <= max(name) <= "\udfff":
+    if not is_plain(name) or any(0xD800 <= ord(letter) <= 0xDFFF for letter in name):
         raise BadNameError(f'The file name "{shown}" has characters that cannot be stored.')
-    if len(name.encode("utf-8", "surrogateescape")) > MAX_NAME_BYTES:
+    if len(name.encode()) > MAX_NAME_BYTES:
         raise BadNameError(f'The file name "{shown}…" is longer than {MAX_NAME_BYTES} bytes.')
     return name
 
 
 def kind_of(name: str) -> Kind:
     """What an uploaded file is, by its name; ``other`` for what a run has no use for."""
-    folded, suffix = name.casefold(), PurePath(name).suffix.casefold()
+    folded, suffix = PurePath(name).name.casefold(), PurePath(name).suffix.casefold()
     if is_photo(PurePath(name)) or suffix in RAW_SUFFIXES:
         return "photo"
     if suffix in FILM_SUFFIXES:
@@ -57,7 +73,7 @@ def control_file(names: Iterable[str]) -> str | None:
     Args:
         names: Names of all uploaded files.
     """
-    listed = sorted(names)
+    listed = sorted(name for name in names if "/" not in name)
     if any(name.casefold() in CONTROL_NAMES for name in listed):
         return None
     texts = (name for name in listed if name.casefold().endswith(".txt") and name.casefold() not in NOT_CONTROL)

@@ -8,13 +8,13 @@ import uuid as uuids
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.app.node.tasks.disk import free_bytes
 from splatpipe.pipeline.app.node.tasks.jobs import JobStore
 from splatpipe.pipeline.app.node.tasks.log import log_lines
-from splatpipe.pipeline.app.node.tasks.names import kind_of, plain_name
+from splatpipe.pipeline.app.node.tasks.names import kind_of, name_with_folders, plain_name
 from splatpipe.pipeline.app.node.tasks.options import NO_OPTIONS, GivenOptions
 from splatpipe.pipeline.app.node.tasks.outgoing import (
     WEBHOOK_DELAY_S,
@@ -45,7 +45,6 @@ from splatpipe.pipeline.app.node.tasks.zip_upload import BadZipError, unpack
 
 UUID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}", re.IGNORECASE)
 MAX_NAME_LETTERS = 255
-MAX_OUTPUTS = 100
 HOUSEKEEPING_S = 30.0
 MAX_NOTED = 50  # files that were left out are named in the log
 NOT_USED = "{} was not used: it is neither a photo nor a survey file."
@@ -185,8 +184,13 @@ class Node:
             raise UnknownTaskError(uuid)
         return task
 
-    def begin_file(self, uuid: str, given_name: str) -> PartFile | None:
+    def begin_file(self, uuid: str, given_name: str, *, folders: bool = False) -> PartFile | None:
         """Begin to receive a file of a task; None if a run has no use for it, so that it is not kept.
+
+        Args:
+            uuid: The task.
+            given_name: Its name as the client states it.
+            folders: Keep its folders; NodeODM's clients expect them to be cut off.
 
         Raises:
             UnknownTaskError: if there is no such task.
@@ -194,16 +198,14 @@ class Node:
             RefusedTaskError: if the task has too many files, or the disk too little room.
             OSError: if the disk is full.
         """
-        name = plain_name(given_name)
+        name = name_with_folders(given_name) if folders else plain_name(given_name)
         task = self.tasks.get(uuid)
         upload = self.tasks.uploads(uuid)
         if kind_of(name) == "other":
             if not task.is_committed:
-                line = NOT_USED.format(name)
-                if line not in task.notes and len(task.notes) < MAX_NOTED:
-                    self.tasks.change(uuid, notes=(*task.notes, line))
+                self.tasks.note(uuid, NOT_USED.format(name), MAX_NOTED)
             return None
-        if len(upload.names()) >= MAX_FILES:
+        if upload.count() >= MAX_FILES:
             raise RefusedTaskError(f"A task has at most {MAX_FILES:,} files.")
         self.reserve(0)
         self.tasks.touch(uuid)
@@ -237,9 +239,23 @@ class Node:
             return task
         return task if task.state == "fetching" else self.scheduler.commit(uuid)
 
-    def lines(self, task: Task) -> list[str]:
-        """The lines of a task's log."""
-        return log_lines(task.notes, self.jobs.output(task.job)) if task.job else list(task.notes)
+    def lines(self, task: Task, line: int = 0) -> list[str]:
+        """The lines of a task's log from one on; a negative number counts from the end."""
+        if not task.job:
+            return list(task.notes)[line:]
+        plain = self.jobs.labels(task.job).plain
+        return [plain(each) for each in log_lines(task.notes, self.jobs.output(task.job))[line:]]
+
+    def restart(self, uuid: str, options: GivenOptions | None) -> Task:
+        """Run an ended task again, with other options if some are given; valid results are reused.
+
+        Raises:
+            UnknownTaskError: if there is no such task.
+            RefusedTaskError: if it has not ended, or the disk is nearly full.
+            OSError: if the disk is full.
+        """
+        self.require_room()
+        return self.scheduler.restart(uuid, options)
 
     def results(self, uuid: str) -> Path | None:
         """The folder of what clients download of a task; None if it has not completed.
@@ -328,7 +344,8 @@ class Node:
                     fetch(parts, write, MAX_TASK_BYTES)
                 left_out = unpack(place, self.tasks.uploads(uuid), self.limit_of, self.reserve)
                 notes = tuple(NOT_USED.format(name) for name in left_out[:MAX_NOTED])
-                self.tasks.change(uuid, notes=(*task.notes, *notes))
+                for line in notes:
+                    self.tasks.note(uuid, line, MAX_NOTED)
                 self.scheduler.commit(uuid)
                 return
             except (OutgoingError, BadZipError, RefusedTaskError, NameTakenError) as trouble:
@@ -371,18 +388,3 @@ def _with(task: Task, wanted: NewTask) -> Task:
         zip_url=wanted.zip_url,
         touched_ms=now_ms(),
     )
-
-
-def parse_outputs(listed: Any) -> tuple[str, ...]:
-    """The paths of ``outputs``.
-
-    Raises:
-        RefusedTaskError: if they are not relative paths within a run's folder.
-    """
-    if not isinstance(listed, list) or len(listed) > MAX_OUTPUTS or not all(isinstance(each, str) for each in listed):
-        raise RefusedTaskError("outputs is not a JSON list of paths.")
-    for each in listed:
-        path = PurePosixPath(each)
-        if not each or path.is_absolute() or ".." in path.parts or "\0" in each or "\\" in each or len(each) > 400:
-            raise RefusedTaskError(f'"{each[:60]}" in outputs is not a path within the results.')
-    return tuple(listed)

@@ -109,7 +109,7 @@ def _to_text(value: Any, _domain: object) -> str:
     text = json.dumps(value) if isinstance(value, dict | list) else value
     if not isinstance(text, str):
         text = str(value) if isinstance(value, int | float) else ""
-    if len(text) > MAX_BOUNDARY_CHARACTERS or "\0" in text:
+    if len(text) > MAX_BOUNDARY_CHARACTERS or any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in text):
         raise OptionValueError("is too long, or is no text")
     return text.strip()
 

@@ -39,6 +39,7 @@ class JobProcess:
         self.key, self.phase, self.child, self.progress = job.key, phase, child, progress
         self.forecast = job.forecast
         self.ending_s = 0.0  # when it was asked to end, time.monotonic(); 0 if it was not
+        self.stalled = False  # whether it was asked because nothing moved
 
 
 def prepare(job: Job, jobs: JobStore, source: Path) -> None:

@@ -71,11 +71,14 @@ def run_options(given: Mapping[str, Any]) -> RunOptions:
             put("georef", option, given[name])
     if given.get("sky"):
         put("export", "sky", True)
-    until = MARKED_AFTER if given.get(MARK_FIRST) else NOT_TRAINED_UNTIL if fast else ""
+    if not fast:
+        put("export", "formats", "tiles")
+        formats = [*(["mesh-tiles"] if mesh else []), *(["mbtiles"] if preset != "preview" or "ortho" in asked else [])]
+        put("publish", "formats", ",".join(formats))
     return RunOptions(
         preset,
         tables,
-        until,
+        MARKED_AFTER if given.get(MARK_FIRST) else NOT_TRAINED_UNTIL if fast else "",
         given.get("time-budget", ""),
         given.get("boundary", ""),
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,7 +16,9 @@ from typing import Any
 from splatpipe.pipeline.app.node.tasks.disk import free_bytes
 from splatpipe.pipeline.app.node.tasks.endings import Verdict, judge_run
 from splatpipe.pipeline.app.node.tasks.jobs import NO_FORECAST, Forecast, Job, JobStore, job_key
+from splatpipe.pipeline.app.node.tasks.log import last_line
 from splatpipe.pipeline.app.node.tasks.names import kind_of
+from splatpipe.pipeline.app.node.tasks.options import GivenOptions
 from splatpipe.pipeline.app.node.tasks.queue import Running, Waiting, next_run, start_times
 from splatpipe.pipeline.app.node.tasks.record import (
     CANCELED,
@@ -38,7 +40,8 @@ from splatpipe.pipeline.app.node.tasks.run import (
 )
 from splatpipe.pipeline.app.node.tasks.settings import Settings
 from splatpipe.pipeline.app.node.tasks.store import TaskStore, UnknownTaskError, now_ms
-from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.app.node.tasks.uploads import FileFacts
+from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, SplatpipeError
 from splatpipe.pipeline.engine.machine import available_memory_bytes, free_memory_bytes
 
 BUSY_S, IDLE_S = 0.1, 1.0  # between looks at the processes, and at the queue if there are none
@@ -49,6 +52,8 @@ STALLED_S = 6 * 3600.0  # without any event, a run is ended and tried again
 WAIT_S = 20.0  # an answer waits at most so long for a run's end: clients wait 30 s
 MEMORY_MARGIN = 1.3  # a forecast is within 30 % of what is used
 FORECAST_TRIES = 3
+DROPPED = "Options that this node does not offer were ignored"
+STALLED = "It stood still for hours and was stopped."
 
 
 class RefusedTaskError(ValueError):
@@ -67,7 +72,6 @@ class TaskStatus:
         stage: The stage that is running; empty otherwise.
         what: What it is doing.
         left_s: Forecast seconds until its end; 0 if unknown.
-        starts_in_s: Estimated seconds until it starts; 0 if it runs, or is unknown.
         waiting: What it waits for besides its turn, a sentence; empty for nothing.
         forecast: What its run needs.
     """
@@ -79,7 +83,6 @@ class TaskStatus:
     stage: str = ""
     what: str = ""
     left_s: float = 0.0
-    starts_in_s: float = 0.0
     waiting: str = ""
     forecast: Forecast = NO_FORECAST
 
@@ -110,6 +113,11 @@ class Scheduler:
         for job in self.jobs.all():
             if job.state == "running":
                 self.jobs.change(job.key, state="queued")
+        for task in self.tasks.all():
+            if task.state == "wanted" and self.jobs.get(task.job) is None:  # its record was lost
+                with suppress(OSError):
+                    photos = self.tasks.uploads(task.uuid).digests()
+                    self._join(task.job, photos, task)
         self._thread.start()
 
     def stop(self) -> None:
@@ -131,7 +139,14 @@ class Scheduler:
         if self.tasks.get(uuid).state not in ("uploading", "fetching"):
             return self.tasks.get(uuid)
         uploads = self.tasks.uploads(uuid)
-        photos = uploads.digests()
+        uploads.close()
+        try:
+            return self._commit(uuid, uploads.digests())
+        except BaseException:
+            uploads.reopen()
+            raise
+
+    def _commit(self, uuid: str, photos: Mapping[str, FileFacts]) -> Task:
         images = sum(kind_of(name) in ("photo", "film") for name in photos)
         if not images:
             raise RefusedTaskError("There are no photos in this task: send JPEG, PNG or TIFF files.")
@@ -139,10 +154,8 @@ class Scheduler:
             task = self.tasks.get(uuid)
             if task.state not in ("uploading", "fetching"):
                 return task
-            notes = task.notes
-            if task.dropped:
-                notes += (f"Options that this node does not offer were ignored: {', '.join(task.dropped)}",)
             job = self._join(job_key(photos, task.options, task.outputs), photos, task)
+            notes = (*task.notes, *_dropped_note(task.dropped))
             task = self.tasks.change(uuid, state="wanted", job=job.key, images=images, notes=notes)
             self._changed.notify_all()
         self._store_once(job, uuid)
@@ -206,7 +219,7 @@ class Scheduler:
             self._changed.notify_all()
         self._await_end(task.job)
 
-    def restart(self, uuid: str, options: Mapping[str, Any] | None, dropped: tuple[str, ...] = ()) -> Task:
+    def restart(self, uuid: str, options: GivenOptions | None) -> Task:
         """Run an ended task again, with other options if some are given; valid results are reused.
 
         Raises:
@@ -216,19 +229,25 @@ class Scheduler:
         """
         with self._changed:
             task = self.tasks.get(uuid)
-            before = self.jobs.get(task.job)
-            if not task.has_ended or (before is None and not self.tasks.uploads(uuid).names()):
+            photos = self.tasks.uploads(uuid).digests() if task.has_ended else {}
+            if not photos:
                 raise RefusedTaskError("Task cannot be restarted")
-            own = self.tasks.uploads(uuid).digests()  # marks may have changed its control file since
-            photos = own if before is None or own.keys() >= before.photos.keys() else before.photos
-            notes = tuple(line for line in task.notes if not line.startswith("Options that"))
-            if dropped:
-                notes += (f"Options that this node does not offer were ignored: {', '.join(dropped)}",)
-            task = replace(task, options=task.options if options is None else dict(options))
+            notes = tuple(line for line in task.notes if not line.startswith(DROPPED))
+            if options is not None:
+                task = replace(task, options=dict(options.values), dropped=options.dropped)
+            notes += _dropped_note(task.dropped)
             job = self._join(job_key(photos, task.options, task.outputs), photos, task, seed=task.job)
-            fresh = {"error": "", "processing_ms": NEVER_STARTED, "ended_ms": 0, "told": False}
-            task = self.tasks.change(
-                uuid, state="wanted", job=job.key, options=task.options, dropped=dropped, notes=notes, **fresh
+            task = self.tasks.replace(
+                replace(
+                    task,
+                    state="wanted",
+                    job=job.key,
+                    notes=notes,
+                    error="",
+                    processing_ms=NEVER_STARTED,
+                    ended_ms=0,
+                    told=False,
+                )
             )
             self._changed.notify_all()
         return task
@@ -265,13 +284,12 @@ class Scheduler:
         if task.state == "completed":
             return TaskStatus(COMPLETED, 100.0, task.processing_ms, forecast=forecast)
         if task.state == "failed":
-            return TaskStatus(FAILED, 100.0, task.processing_ms, task.error, forecast=forecast)
+            return TaskStatus(FAILED, 0.0, task.processing_ms, task.error, forecast=forecast)
         if task.state == "canceled":
             return TaskStatus(CANCELED, 0.0, NEVER_STARTED, forecast=forecast)
         if job is None or process is None or process.phase == "forecast" or job.state in ("new", "queued"):
             waiting = "" if job is None else job.waiting
-            starts_in_s = 0.0 if job is None else self._start_times().get(job.key, 0.0)
-            return TaskStatus(QUEUED, 0.0, NEVER_STARTED, waiting=waiting, starts_in_s=starts_in_s, forecast=forecast)
+            return TaskStatus(QUEUED, 0.0, NEVER_STARTED, waiting=waiting, forecast=forecast)
         progress = process.progress
         spent_s = job.seconds + time.monotonic() - process.child.began_s
         return TaskStatus(
@@ -291,7 +309,8 @@ class Scheduler:
         running = sum(key in under_way for key in active)
         return len(active) - running, running
 
-    def _start_times(self) -> dict[str, float]:
+    def start_times(self) -> dict[str, float]:
+        """Estimated seconds until each waiting job starts, by its key, in the order of the queue."""
         return start_times(self._waiting(), self._running(), self.settings.parallel)
 
     def _wanted(self) -> set[str]:
@@ -357,13 +376,15 @@ class Scheduler:
         if code is not None:
             del self._processes[process.key]
             self._changed.notify_all()
-            self._ended(process, code, wanted and not process.ending_s)
+            self._ended(process, code, wanted and (process.stalled or not process.ending_s))
         elif process.ending_s:
             if now_s - process.ending_s > END_S:
                 process.child.wait_or_kill(now_s)
-        elif not wanted or (process.progress is not None and now_s - process.progress.moved_s > STALLED_S):
-            process.ending_s = now_s
-            process.child.ask_to_end()
+        else:
+            process.stalled = process.progress is not None and now_s - process.progress.moved_s > STALLED_S
+            if process.stalled or not wanted:
+                process.ending_s = now_s
+                process.child.ask_to_end()
 
     def _advance(self, job: Job, now_s: float) -> None:
         """Take the next step of a wanted job that has no process."""
@@ -433,11 +454,7 @@ class Scheduler:
             return
         spent_s = round(job.seconds + time.monotonic() - process.child.began_s, 3)
         if process.phase == "pack":
-            if code == 0:
-                job = self.jobs.change(job.key, state="done", seconds=spent_s, ended_ms=now_ms(), waiting="")
-                self._settle(job)
-            elif wanted:
-                self._judge(job, judge_run(code, "", "The results could not be packed.", job.tries))
+            self._pack_ended(job, code, spent_s, wanted)
             return
         if code == 0:
             self.jobs.change(job.key, state="packing", seconds=spent_s, tries=0)
@@ -447,21 +464,25 @@ class Scheduler:
             progress = process.progress
             assert progress is not None
             progress.read()
-            text = f"{progress.message} {progress.hint}".strip()
-            self._judge(job, judge_run(code, text, self._last_line(job), job.tries))
+            text = STALLED if process.stalled else f"{progress.message} {progress.hint}".strip()
+            last = last_line(self.jobs.output(job.key))
+            self._judge(job, judge_run(EXIT_STAGE if process.stalled else code, text, last, job.tries))
+
+    def _pack_ended(self, job: Job, code: int, spent_s: float, wanted: bool) -> None:
+        if code == 0:
+            self._settle(self.jobs.change(job.key, state="done", seconds=spent_s, ended_ms=now_ms(), waiting=""))
+        elif wanted:
+            text = last_line(self.jobs.output(job.key))
+            self._judge(job, judge_run(EXIT_MACHINE if code == EXIT_MACHINE else EXIT_STAGE, text, "", job.tries))
 
     def _judge(self, job: Job, verdict: Verdict) -> None:
+        text = self.jobs.labels(job.key).plain(verdict.text)
         if verdict.final:
-            job = self.jobs.change(job.key, state="failed", error=verdict.text, ended_ms=now_ms(), waiting="")
+            job = self.jobs.change(job.key, state="failed", error=text, ended_ms=now_ms(), waiting="")
             self._settle(job)
         else:
             self.jobs.change(job.key, tries=job.tries + 1)
-            self._put_off(job, verdict.text, verdict.delay_s)
-
-    def _last_line(self, job: Job) -> str:
-        from splatpipe.pipeline.app.node.tasks.log import last_line
-
-        return last_line(self.jobs.output(job.key))
+            self._put_off(job, text, verdict.delay_s)
 
     def _forecast_ended(self, job: Job, wanted: bool) -> None:
         if not wanted:
@@ -469,7 +490,7 @@ class Scheduler:
         try:
             found = read_forecast(job, self.jobs)
             if "error" in found:
-                error = str(found["error"])
+                error = self.jobs.labels(job.key).plain(str(found["error"]))
                 if found.get("lasting"):
                     self._judge(job, Verdict(error, final=True))
                 else:
@@ -491,8 +512,12 @@ class Scheduler:
 
     def _settle(self, job: Job) -> None:
         """Pass the end of a job on to the tasks that want it."""
-        ended = {"ended_ms": now_ms(), "processing_ms": int(1000 * job.seconds), "error": job.error, "told": False}
+        ended: dict[str, Any] = {"ended_ms": now_ms(), "processing_ms": int(1000 * job.seconds), "error": job.error}
         state = "completed" if job.state == "done" else "failed"
         for task in self.tasks.all():
             if task.state == "wanted" and task.job == job.key:
-                self.tasks.change(task.uuid, later=True, state=state, **ended)
+                self.tasks.change(task.uuid, later=True, state=state, told=False, **ended)
+
+
+def _dropped_note(dropped: Sequence[str]) -> tuple[str, ...]:
+    return (f"{DROPPED}: {', '.join(dropped)}",) if dropped else ()

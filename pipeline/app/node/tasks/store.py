@@ -155,6 +155,17 @@ class TaskStore:
             self._uploads.pop(uuid, None)
             self._unwritten.discard(uuid)
 
+    def note(self, uuid: str, line: str, most: int) -> None:
+        """Add a line to the notes of a task, once; no more than ``most``.
+
+        Raises:
+            UnknownTaskError: if there is none.
+        """
+        with self._lock:
+            notes = self.get(uuid).notes
+            if line not in notes and len(notes) < most:
+                self.change(uuid, later=True, notes=(*notes, line))
+
     def touch(self, uuid: str) -> None:
         """Note that a client works on a task, in memory only."""
         with self._lock:
@@ -171,6 +182,8 @@ class TaskStore:
             self.get(uuid)
             if uuid not in self._uploads:
                 self._uploads[uuid] = UploadFolder(self.path(uuid) / UPLOAD_FOLDER)
+                if self.get(uuid).is_committed:
+                    self._uploads[uuid].close()
             return self._uploads[uuid]
 
     def path(self, uuid: str) -> Path:

@@ -13,6 +13,8 @@ import sys
 from splatpipe.pipeline.engine.python_module import python_module
 from splatpipe.pipeline.engine.runs.children import die_with_parent
 
+NICENESS = 5  # the node answers first
+
 MODULE = "splatpipe.pipeline.app.node.tasks.under_parent"
 
 
@@ -20,6 +22,7 @@ def main() -> None:
     """Become the module named on the command line."""
     parent, module, *arguments = sys.argv[1:]
     die_with_parent(int(parent))
+    os.nice(NICENESS)
     command = python_module(module, *arguments)
     os.execv(command[0], command)
 

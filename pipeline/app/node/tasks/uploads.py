@@ -10,12 +10,14 @@ import hashlib
 import json
 import os
 import threading
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.engine.files.durable import sync_folder
+from splatpipe.pipeline.app.node.tasks.names import MAX_FOLDERS
+from splatpipe.pipeline.engine.files.durable import sync_folder, write_durably
 from splatpipe.pipeline.engine.files.output_file import appended_file, new_file, token
 from splatpipe.pipeline.engine.files.small_file import read_small
 
@@ -37,6 +39,10 @@ class NameTakenError(ValueError):
     """A file of this name and with other content is there already; the message is a sentence."""
 
 
+class ClosedUploadError(ValueError):
+    """The upload is complete; the message is a sentence."""
+
+
 class UploadFolder:
     """The folder of a task's files; safe to use from several threads.
 
@@ -47,14 +53,45 @@ class UploadFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._lock = threading.Lock()
+        self._closed = False
         for part in path.glob(f".*{PART}"):
             part.unlink(missing_ok=True)
         self._facts = self._read_journal()
 
+    def sizes(self) -> dict[str, int]:
+        """Sizes of the whole files by name, in order; names have their folders."""
+        with self._lock:
+            return dict(sorted(self._present().items()))
+
     def names(self) -> list[str]:
         """Names of the whole files, in order."""
+        return list(self.sizes())
+
+    def count(self) -> int:
+        """Number of files whose digests are known."""
+        return len(self._facts)
+
+    def close(self) -> None:
+        """Take no further files: only those that are there already, a second time."""
         with self._lock:
-            return sorted(self._present())
+            self._closed = True
+
+    def reopen(self) -> None:
+        """Take files again."""
+        with self._lock:
+            self._closed = False
+
+    def put(self, name: str, content: bytes) -> None:
+        """Write a file in place of another of its name, whether files are taken or not.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        with self._lock:
+            (self.path / name).parent.mkdir(parents=True, exist_ok=True)
+            write_durably(self.path / name, lambda file: file.write(content))
+            self._facts[name] = FileFacts(len(content), hashlib.sha256(content).hexdigest())
+            self._note(name, self._facts[name])
 
     def begin(self, name: str) -> PartFile:
         """Begin to receive a file.
@@ -104,6 +141,7 @@ class UploadFolder:
 
         Raises:
             NameTakenError: if there is another with other content.
+            ClosedUploadError: if no files are taken any more.
             OSError: if it cannot be renamed.
         """
         with self._lock:
@@ -118,14 +156,17 @@ class UploadFolder:
                         "only once: rename one of them."
                     )
                 return
+            if self._closed:
+                part.discard()
+                raise ClosedUploadError("The upload of this task is complete: no further file is taken.")
+            target.parent.mkdir(parents=True, exist_ok=True)
             part.path.rename(target)
-            sync_folder(self.path)
+            sync_folder(target.parent)
             self._facts[part.name] = facts
             self._note(part.name, facts)
 
     def _present(self) -> dict[str, int]:
-        with os.scandir(self.path) as entries:
-            return {each.name: each.stat().st_size for each in entries if not each.name.startswith(".")}
+        return dict(_files(self.path, "", MAX_FOLDERS))
 
     def _note(self, name: str, facts: FileFacts) -> None:
         with suppress(OSError), appended_file(self.path / JOURNAL) as file:  # without it, the file is read again
@@ -191,6 +232,18 @@ class PartFile:
         with suppress(OSError, ValueError):
             self._file.close()
         self.path.unlink(missing_ok=True)
+
+
+def _files(folder: Path, above: str, depth: int) -> Iterator[tuple[str, int]]:
+    """Names and sizes of the files in a folder and those below, except hidden ones."""
+    with os.scandir(folder) as entries:
+        for each in entries:
+            if each.name.startswith("."):
+                continue
+            if each.is_dir(follow_symlinks=False) and depth:
+                yield from _files(Path(each.path), f"{above}{each.name}/", depth - 1)
+            elif each.is_file(follow_symlinks=False):
+                yield f"{above}{each.name}", each.stat().st_size
 
 
 def file_facts(path: Path) -> FileFacts:
