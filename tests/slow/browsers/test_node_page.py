@@ -14,7 +14,6 @@ from splatpipe.demo import capture_path
 PIXELS = 480  # of the longer side: enough to be matched and placed
 PHOTOS = 12
 RUN_MS = 600_000.0  # until a run has ended, on a busy machine
-WIDTHS = ((1440, 900), (390, 844))
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +79,8 @@ def test_a_folder_is_dropped_checked_run_and_its_results_are_opened(
     assert watched.errors == [] and all(url.startswith(node.address) for url in watched.requests)
 
 
-@pytest.mark.parametrize(("width", "height"), WIDTHS)
-def test_control_points_of_a_finished_run_are_marked_from_the_page(
-    node: StartedNode, open_page: Callable, width: int, height: int
-) -> None:
-    page = open_page(node.page, width=width, height=height).page
-    assert fits(page)
+def test_control_points_of_a_finished_run_are_marked_from_the_page(node: StartedNode, open_page: Callable) -> None:
+    page = open_page(node.page).page
     job(page).get_by_role("link", name="Mark control points").click()
     page.wait_for_url("**/mark")
     page.evaluate("splatpipe.mark.ready")

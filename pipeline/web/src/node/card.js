@@ -34,7 +34,7 @@ export class JobCard {
     this.state = element("p", { class: "state" });
     this.facts = element("p", { class: "small" });
     this.root = element("article", { class: "job", "data-uuid": task.uuid }, element("header", {}, this.heading, this.state, this.facts));
-    for (const name of ["upload", "check", "form", "progress", "said", "results", "actions", "log"]) {
+    for (const name of ["upload", "check", "progress", "said", "results", "form", "actions", "log"]) {
       this.panels[name] = element("div", { class: name, hidden: true });
       this.root.append(this.panels[name]);
     }
