@@ -11,8 +11,9 @@ from playwright.sync_api import Locator, Page, expect
 
 from splatpipe.demo import capture_path
 
-PIXELS = 480  # of the longer side: enough to be matched and placed
+PIXELS = 400  # of the longer side: enough to be matched and placed
 PHOTOS = 12
+BUDGET = "15s"  # of the run: its training is short
 RUN_MS = 600_000.0  # until a run has ended, on a busy machine
 
 
@@ -63,6 +64,9 @@ def test_a_folder_is_dropped_checked_run_and_its_results_are_opened(
         card.get_by_role("link", name="map of the overlap").click()
     expect(opened.value.locator(".drawn svg")).to_be_visible()
     card.get_by_label("preview").check()
+    card.get_by_text("More options").click()
+    card.get_by_label("Quality of keypoints").select_option("lowest")
+    card.get_by_label("Time budget").fill(BUDGET)
     card.get_by_role("button", name="Start", exact=True).focus()
     page.keyboard.press("Enter")
     expect(card.locator(".state")).to_have_text("Finished", timeout=RUN_MS)
@@ -72,6 +76,7 @@ def test_a_folder_is_dropped_checked_run_and_its_results_are_opened(
     assert opened.value.evaluate("origin") == "null"
     with page.expect_popup() as opened:
         card.get_by_role("link", name="3D viewer").click()
+    opened.value.wait_for_load_state("load")
     opened.value.evaluate("splatpipe.ready")
     with page.expect_download() as saved:
         card.get_by_role("link", name="All files (all.zip)").click()
