@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import logging
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -71,6 +72,7 @@ def serve(
         MachineError: if the port is taken, or another node works in the folder.
     """
     check_options(options)
+    logging.getLogger("python_multipart").setLevel(logging.CRITICAL)  # bodies that it cannot read are the client's
     with locked_folder(options.folder):
         threads = max(1, available_cores() // options.parallel)
         settings = Settings(options.folder.resolve(), options.parallel, threads, options.keep_days)

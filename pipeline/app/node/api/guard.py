@@ -22,7 +22,9 @@ from splatpipe.pipeline.app.serving.refusals import HOSTS, RefusedError, check_o
 PATH = re.compile(rb"/(?:\w[\w.~-]*(?:/\w[\w.~-]*)*/?)?", re.ASCII)  # no escapes, no dots first
 MAX_PATH_LETTERS = 400
 MAX_QUERY_LETTERS = 4096
+MAX_HEADER_BYTES = 16 << 10  # of all headers: cookies of other servers on 127.0.0.1 come along
 MAX_PARAMETERS = 32
+VERSIONS = ("1.0", "1.1")
 METHODS = ("GET", "HEAD", "POST", "OPTIONS")
 HEADERS = {
     "x-content-type-options": "nosniff",
@@ -89,6 +91,10 @@ class Guard:
         Raises:
             RefusedError: if it is not allowed.
         """
+        if scope["http_version"] not in VERSIONS:
+            raise RefusedError(505, "Only HTTP/1.0 and HTTP/1.1 are spoken here.")
+        if sum(len(name) + len(value) for name, value in scope["headers"]) > MAX_HEADER_BYTES:
+            raise RefusedError(431, "The headers are too long.")
         host = only_header(scope["headers"], b"host", "Host")
         headers = Headers(scope=scope)
         if self._local:

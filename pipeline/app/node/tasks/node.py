@@ -285,13 +285,13 @@ class Node:
 
     def _keep_house(self) -> None:
         while True:
-            for work in (self.tasks.empty_trash, self._remove_old, self._remove_unused, self._resume):
+            for work in (self.tasks.empty_trash, self.remove_old, self.scheduler.remove_unused, self._resume):
                 with suppress(OSError):
                     work()
             if self._stopping.wait(HOUSEKEEPING_S):
                 return
 
-    def _remove_old(self) -> None:
+    def remove_old(self) -> None:
         """Remove ended tasks whose time is over, and uploads that were given up."""
         now, keep_ms = now_ms(), 1000 * DAY_S * self.settings.keep_days
         for task in self.tasks.all():
@@ -300,9 +300,6 @@ class Node:
             if old or given_up:
                 with suppress(UnknownTaskError):
                     self.scheduler.remove(task.uuid)
-
-    def _remove_unused(self) -> None:
-        self.scheduler.remove_unused()
 
     def _resume(self) -> None:
         for task in self.tasks.all():

@@ -110,15 +110,18 @@ class Scheduler:
 
     def start(self) -> None:
         """Begin to run what is wanted."""
+        self.restore()
+        self._thread.start()
+
+    def restore(self) -> None:
+        """Go on from the records of an earlier process, however it ended."""
         for job in self.jobs.all():
             if job.state == "running":
                 self.jobs.change(job.key, state="queued")
         for task in self.tasks.all():
             if task.state == "wanted" and self.jobs.get(task.job) is None:  # its record was lost
                 with suppress(OSError):
-                    photos = self.tasks.uploads(task.uuid).digests()
-                    self._join(task.job, photos, task)
-        self._thread.start()
+                    self._join(task.job, self.tasks.uploads(task.uuid).digests(), task)
 
     def stop(self) -> None:
         """End all processes; their jobs go on when the node is started again."""
