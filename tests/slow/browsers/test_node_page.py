@@ -8,6 +8,7 @@ from marked_points import POINTS
 from node_process import StartedNode, drop, started
 from PIL import Image
 from playwright.sync_api import Locator, Page, expect
+from timeouts import TIMEOUT_S
 
 from splatpipe.demo import capture_path
 
@@ -15,6 +16,14 @@ PIXELS = 400  # of the longer side: enough to be matched and placed
 PHOTOS = 12
 BUDGET = "15s"  # of the run: its training is short
 RUN_MS = 600_000.0  # until a run has ended, on a busy machine
+
+
+@pytest.fixture(autouse=True, scope="module")
+def patience() -> Iterator[None]:
+    """Wait as long as elsewhere for what the page shall show: this machine may be busy."""
+    expect.set_options(timeout=1000.0 * TIMEOUT_S)
+    yield
+    expect.set_options(timeout=5000.0)
 
 
 @pytest.fixture(scope="module")
