@@ -247,8 +247,10 @@ export class JobCard {
     const pause = can.pause ? [this.#pauseBox()] : [];
     if (this.upload && !this.upload.complete) return [...pause, element("button", { type: "button", class: "first", disabled: true }, "Start")];
     const checked = check?.state === "done";
+    const idle = ["none", "failed", undefined].includes(check?.state);
     const text = !checked ? "Start without the check" : check.verdict === "error" ? "Start all the same" : "Start";
-    return [...pause, button(text, () => this.page.start(this), checked && check.verdict !== "error" ? "first" : "")];
+    const again = idle ? [button("Check", () => this.page.check(this), "first")] : [];
+    return [...pause, ...again, button(text, () => this.page.start(this), checked && check.verdict !== "error" ? "first" : "")];
   }
 
   #pauseBox() {
