@@ -72,6 +72,7 @@ def test_a_folder_is_dropped_checked_run_and_its_results_are_opened(
     with page.expect_popup() as opened:
         card.get_by_role("link", name="map of the overlap").click()
     expect(opened.value.locator(".drawn svg")).to_be_visible()
+    opened.value.close()
     card.get_by_label("preview").check()
     card.get_by_text("More options").click()
     card.get_by_label("Quality of keypoints").select_option("lowest")
@@ -83,10 +84,12 @@ def test_a_folder_is_dropped_checked_run_and_its_results_are_opened(
         card.get_by_role("link", name="Report", exact=True).click()
     expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
     assert opened.value.evaluate("origin") == "null"
+    opened.value.close()
     with page.expect_popup() as opened:
         card.get_by_role("link", name="3D viewer").click()
     opened.value.wait_for_load_state("load")
     opened.value.evaluate("splatpipe.ready")
+    opened.value.close()
     with page.expect_download() as saved:
         card.get_by_role("link", name="All files (all.zip)").click()
     assert saved.value.suggested_filename == "all.zip"
