@@ -100,7 +100,7 @@ class Scheduler:
         if job is None:
             others = [each for each in self.jobs.all() if each.photos == photos and each.key != key]
             seed = seed or next((each.key for each in others if each.has_ended), others[0].key if others else "")
-            job = Job(key, photos, dict(task.options), task.outputs, seed=seed, queued_ms=now_ms())
+            job = Job(key, photos, dict(task.options), task.outputs, task.name, seed=seed, queued_ms=now_ms())
             self.jobs.put(job)
         elif job.state == "failed":
             self.jobs.output(key).unlink(missing_ok=True)
