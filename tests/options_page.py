@@ -1,4 +1,4 @@
-"""``make options-page``: writes the tables of ``docs/options.md`` from the options' own types, defaults and help."""
+"""``make options-page``: writes the tables of ``docs/options.md`` and ``docs/node.md`` from the options' own help."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from typing import Annotated, Any, Literal
 from generated_pages import write
 from pydantic.fields import FieldInfo
 
+from splatpipe.pipeline.app.node.tasks.options import LISTED
 from splatpipe.pipeline.engine.config import load_preset, lookup, option_help, preset_names, resolve
 from splatpipe.stages.options import LineConfig
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
 MARK = "<!-- Below this line: make options-page -->"
+NODE_PAGE = PAGE.with_name("node.md")
+NODE_BEGIN, NODE_END = "<!-- options of a job: make options-page -->", "<!-- end of options -->"
 KINDS = {bool: "`true`, `false`", str: "text", int: "whole number", float: "number"}
 
 
@@ -26,6 +29,22 @@ def written() -> str:
     if not mark:
         raise ValueError(f"{PAGE} has no line {MARK}")
     return f"{by_hand}{MARK}\n\n{tables()}"
+
+
+def node_page() -> str:
+    """Return the page of the node, with the table of a job's options."""
+    before, begin, rest = NODE_PAGE.read_text(encoding="utf-8").partition(NODE_BEGIN)
+    _, end, after = rest.partition(NODE_END)
+    if not begin or not end:
+        raise ValueError(f"{NODE_PAGE} has no lines {NODE_BEGIN} and {NODE_END}")
+    lines = ["| option | default | what it does |", "|---|---|---|"]
+    for option in LISTED:
+        choices = ", ".join(option.domain) if isinstance(option.domain, tuple) else ""
+        text = option.help.partition(" Can be one of:")[0].partition(" Default:")[0]
+        default = {"": "", "0": "", "false": "off"}.get(option.default, f"`{option.default}`")
+        lines.append(f"| `{option.name}` | {default} | {text}{f' ({choices})' if choices else ''} |")
+    table = "\n".join(lines)
+    return f"{before}{begin}\n\n{table}\n\n{end}{after}"
 
 
 def tables() -> str:
@@ -89,4 +108,4 @@ def _limits(limits: Sequence[Any]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(write({PAGE: written()}))
+    sys.exit(write({PAGE: written(), NODE_PAGE: node_page()}))

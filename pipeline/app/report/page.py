@@ -55,9 +55,16 @@ def report_page(inputs: ReportInputs, content: Mapping[str, Any]) -> str:
     return page_text(TEMPLATES, "report.html.j2", places, style="report.css", script="report.js", **content)
 
 
+def _name(inputs: ReportInputs) -> str:
+    """The run's name: the title that its viewer was given, else its folder's."""
+    if inputs.config is not None and inputs.config.export.title != type(inputs.config.export)().title:
+        return inputs.config.export.title
+    return inputs.out.resolve().name or str(inputs.out)
+
+
 def _content(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> dict[str, Any]:
     return {
-        "name": inputs.out.resolve().name or str(inputs.out),
+        "name": _name(inputs),
         "photos_dir": "" if inputs.photos_dir is None else inputs.photos_dir.name,
         "began": moment(inputs.history.began_s) if inputs.history.began_s else "",
         "version": importlib.metadata.version("splatpipe"),

@@ -26,6 +26,8 @@ const page = {
 
   resume: (card) => upload(card),
 
+  check: (card) => attempt(card, () => postJson(`api/check/${card.uuid}`, {})),
+
   without(card) {
     const refused = new Set(card.upload.refused.map(({ name }) => name));
     card.upload.files = card.upload.files.filter(({ name }) => !refused.has(name));
@@ -35,9 +37,8 @@ const page = {
 
   start: (card) => attempt(card, async () => {
     if (invalid(card)) return;
-    const name = card.form().name?.value.trim() || card.task.name;
     const options = card.form().values();
-    await postJson(`api/start/${card.uuid}`, { name, options, pause: card.pause?.checked === true });
+    await postJson(`api/start/${card.uuid}`, { name: card.name, options, pause: card.pause?.checked === true });
     card.upload = null;
     card.heading.focus();
   }),
@@ -110,7 +111,7 @@ async function take(files, into = null) {
 async function begin(found, into) {
   const { photos, files, title, others } = found;
   if (!photos.length) {
-    const only = others.length ? ` Its ${count(others.length, "file")} are of other kinds.` : "";
+    const only = others.length ? ` It has ${count(others.length, "file")} of other kinds.` : "";
     throw new UnfitDropError(`There are no photos in this.${only} Photos are ${node.accepts.photos.join(", ")}.`);
   }
   const bytes = files.reduce((sum, { file }) => sum + file.size, 0);
@@ -141,7 +142,7 @@ async function unfinished({ title, files }) {
 
 async function made(name, files, bytes) {
   const { uuid } = await postJson("api/new", { name, files, bytes });
-  await refresh();
+  while (!cards.has(uuid)) await refresh().then(() => cards.has(uuid) || new Promise((resolve) => setTimeout(resolve, POLL_MS)));
   return cards.get(uuid);
 }
 
@@ -153,19 +154,25 @@ async function upload(card) {
 function uploaded(card) {
   card.upload.doneFiles = card.upload.files.length;
   card.upload.doneBytes = card.upload.files.reduce((sum, { file }) => sum + file.size, 0);
-  attempt(card, () => postJson(`api/check/${card.uuid}`, {}));
+  page.check(card);
 }
 
 // What the node says.
 
 let polling = 0;
 let asked = 0;
+let latest = null; // the last request for the state
 
-async function refresh() {
-  const mine = (asked += 1);
+/** Ask the node for its state, and show it; resolves when that or a later state is shown, or the node does not answer. */
+function refresh() {
+  asked += 1;
+  return (latest = shown(asked));
+}
+
+async function shown(mine) {
   try {
     const state = await getJson("api/state");
-    if (mine !== asked) return; // a later answer is on its way
+    if (mine !== asked) return latest;
     by("silent").hidden = true;
     show(state);
   } catch (error) {

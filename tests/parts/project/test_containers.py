@@ -24,6 +24,7 @@ REASONS = (
     "Name a folder of capture folders",
     "does not contain a run",
     "CUDA does not work here",
+    "everybody could use this node",
 )
 COMMAND = re.compile(r"^ +(?:command|args): \[([^]]+)\]", re.MULTILINE)
 

@@ -192,6 +192,10 @@ def test_the_page_of_options_matches_the_code() -> None:
     assert options_page.PAGE.read_text(encoding="utf-8") == options_page.written(), "run: make options-page"
 
 
+def test_the_table_of_a_nodes_options_matches_the_code() -> None:
+    assert options_page.NODE_PAGE.read_text(encoding="utf-8") == options_page.node_page(), "run: make options-page"
+
+
 def test_the_page_of_options_has_types_limits_and_presets() -> None:
     rows = {
         row.split(" | ")[0].strip("| `"): row for row in options_page.tables().splitlines() if row.startswith("| `")

@@ -15,15 +15,15 @@ from splatpipe.pipeline.app.node.page.gate import PageAccess
 from splatpipe.pipeline.app.node.page.results import Results
 from splatpipe.pipeline.app.node.tasks.disk import free_bytes
 from splatpipe.pipeline.app.node.tasks.jobs import Job
-from splatpipe.pipeline.app.node.tasks.names import CONTROL_NAMES, control_file, kind_of
+from splatpipe.pipeline.app.node.tasks.names import CONTROL_NAMES, RAW_SUFFIXES, control_file, kind_of
 from splatpipe.pipeline.app.node.tasks.node import Node
 from splatpipe.pipeline.app.node.tasks.options import LISTED
 from splatpipe.pipeline.app.node.tasks.record import QUEUED, RUNNING, Task
 from splatpipe.pipeline.app.node.tasks.run_options import MARK_FIRST
-from splatpipe.pipeline.app.node.tasks.scheduler import TaskStatus
 from splatpipe.pipeline.app.node.tasks.settings import MAX_FILES
+from splatpipe.pipeline.app.node.tasks.status import TaskStatus
 from splatpipe.pipeline.engine.files.small_file import read_small
-from splatpipe.pipeline.engine.runs.source import MAX_NAMED_BYTES
+from splatpipe.pipeline.engine.runs.source import FILM_SUFFIXES, MAX_NAMED_BYTES
 from splatpipe.pipeline.photos.files.names import PHOTO_SUFFIXES
 from splatpipe.stages.line import LINE
 
@@ -204,7 +204,7 @@ class Facts:
             "running": running,
             "keep_days": settings.keep_days,
             "max_photos": MAX_FILES,
-            "accepts": {"photos": [*PHOTO_SUFFIXES], "survey": survey_names()},
+            "accepts": accepted(),
         }
 
     def _without_paths(self, text: str, job: str) -> str:
@@ -225,8 +225,17 @@ def state_of(task: Task, status: TaskStatus | None) -> str:
     return "running" if status.code == RUNNING else "waiting"
 
 
-def survey_names() -> dict[str, str]:
-    """The survey files that a run finds beside photos, by name, and what each is."""
+def accepted() -> dict[str, Any]:
+    """What a run takes: suffixes of photos, of raw photos and of films; survey files by name, with what each is."""
+    return {
+        "photos": [*PHOTO_SUFFIXES],
+        "raws": [suffix.lstrip(".") for suffix in RAW_SUFFIXES],
+        "films": [suffix.lstrip(".") for suffix in FILM_SUFFIXES],
+        "survey": _survey_names(),
+    }
+
+
+def _survey_names() -> dict[str, str]:
     return {
         name: SURVEY.get(file.part, file.part) for stage in LINE for file in stage.files.values() for name in file.names
     }

@@ -12,10 +12,10 @@ from splatpipe.pipeline.app.report import PDF_FILE, REPORT_FILE
 from splatpipe.pipeline.app.view.landing import BROWSER_SUFFIXES, VIEWER, WHAT, downloadable_files
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.runs.run_folder import RunFolder, open_run_folder
-from splatpipe.pipeline.web.measured_page import SITE, SITE_PAGE
+from splatpipe.pipeline.web.measured_page import SITE_PAGE
 from splatpipe.stages.line import LINE
 
-ALL = "all.zip"
+ALL, PDF = "all.zip", ".pdf"
 MAIN = {REPORT_FILE: "Report", VIEWER: "3D viewer", PDF_FILE: "Report as PDF"}
 MOST_KNOWN = 500  # runs whose files are remembered
 
@@ -54,13 +54,14 @@ class Results:
         folder, out, names = self._access.results(task.uuid), self._jobs.out(task.job), self.names(task)
         found = []
         for name in sorted(names, key=lambda each: list(MAIN).index(each) if each in MAIN else len(MAIN)):
-            if name.startswith(SITE) and name != SITE_PAGE:
+            if "/" in name and name != SITE_PAGE:  # tiles and the like are thousands; all.zip has them
                 continue
             try:
                 size = (out / name).lstat().st_size
             except OSError:
                 continue
-            inside = PurePosixPath(name).suffix in BROWSER_SUFFIXES
+            suffix = PurePosixPath(name).suffix
+            inside = suffix in BROWSER_SUFFIXES and suffix != PDF  # browsers show none in a sandbox
             entry = {
                 "title": name,
                 "text": WHAT.get(name, ""),

@@ -24,7 +24,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from splatpipe.pipeline.app.node.api.answers import DISK_FULL
-from splatpipe.pipeline.app.node.api.bodies import limited
+from splatpipe.pipeline.app.node.api.bodies import drain_rest, limited
 from splatpipe.pipeline.app.node.api.multipart import BLOCK_BYTES, BadBodyError
 from splatpipe.pipeline.app.node.api.received import UploadedFile
 from splatpipe.pipeline.app.node.api.routes import Api
@@ -54,7 +54,7 @@ MAX_TOKEN_LETTERS = 512
 MAX_NAME_LETTERS = 200
 LOOK_S = 0.3
 HTML = {"content-security-policy": CSP_OURS, "cross-origin-opener-policy": "same-origin"}
-VIEW_PAGES = ("mark", "live")
+VIEW_PAGES, LIVE = ("mark", "live"), "live/"
 PASSED_ON = ("content-type", "if-none-match", "accept")
 
 
@@ -122,16 +122,19 @@ class Page:
         ]
         refusals: dict[Any, int] = {UnknownTaskError: 404, RefusedTaskError: 409, NameTakenError: 409}
         refusals |= {WrongOptionsError: 422, BadNameError: 422, BadBodyError: 400}
-        handlers: dict[Any, Any] = {
-            error: lambda _request, error, status=status: _said(status, _words(error))
-            for error, status in refusals.items()
-        }
-        handlers |= {
-            MachineError: lambda _request, error: _said(503, f"{error.message} {error.hint}".strip()),
-            OSError: lambda _request, _error: _said(507, DISK_FULL),
-            HTTPException: lambda _request, error: _said(error.status_code, str(error.detail)),
-        }
-        return Starlette(routes=routes, exception_handlers=handlers)
+
+        async def refused(request: Request, error: Exception) -> Response:
+            await drain_rest(request)  # otherwise a browser that still sends does not read the answer
+            if isinstance(error, HTTPException):
+                return _said(error.status_code, str(error.detail))
+            if isinstance(error, MachineError):
+                return _said(503, f"{error.message} {error.hint}".strip())
+            if isinstance(error, OSError):
+                return _said(507, DISK_FULL)
+            return _said(next(refusals[kind] for kind in refusals if isinstance(error, kind)), _words(error))
+
+        handled = (*refusals, MachineError, OSError, HTTPException)
+        return Starlette(routes=routes, exception_handlers=dict.fromkeys(handled, refused))
 
     # The entrance.
 
@@ -264,12 +267,13 @@ class Page:
             return RedirectResponse(self._access.address, 303)
         if path in VIEW_PAGES:
             self._open_view(task)
+        return await self._from_view(task, request, path, HTML if path in VIEW_PAGES else {})
+
+    async def _from_view(self, task: Task, request: Request, path: str, own: dict[str, str]) -> Response:
         query = request.url.query
         headers = {name: value for name in PASSED_ON if (value := request.headers.get(name)) is not None}
-        body = await _limited(request)
-        target = f"/{path}{'?' if query else ''}{query}"
+        target, body = f"/{path}{'?' if query else ''}{query}", await _limited(request)
         found = await to_thread.run_sync(self.views.ask, task.uuid, request.method, target, headers, body)
-        own = HTML if path in VIEW_PAGES else {}
         return StreamingResponse(found.body, found.status, dict(found.headers) | own)
 
     def _open_view(self, task: Task) -> None:
@@ -280,23 +284,26 @@ class Page:
             what |= {"upload": str(self._tasks.uploads(task.uuid).path), "shown": shown}
         self.views.start(task.uuid, what, self._jobs.path(task.job) / "view.log")
 
-    def _result(self, request: Request) -> Response:
-        """A file of a run; its name is only compared with the known ones."""
+    async def _result(self, request: Request) -> Response:
+        """A file of a run; its name is only compared with the known ones. What is not finished comes from a view."""
         given = request.path_params
         try:
             task = self._tasks.get(given["uuid"])
-        except UnknownTaskError as error:
+            if given["path"].startswith(LIVE) and self._access.opens_results(task.uuid, given["mac"]):
+                return await self._from_view(task, request, given["path"], {})
+            return await to_thread.run_sync(self._file_of, task, given["mac"], given["path"])
+        except (UnknownTaskError, MachineError) as error:
             raise HTTPException(404) from error
-        if not self._access.opens_results(task.uuid, given["mac"]) or given["path"] not in self._facts.result_names(
-            task
-        ):
+
+    def _file_of(self, task: Task, mac: str, path: str) -> Response:
+        if not self._access.opens_results(task.uuid, mac) or path not in self._facts.result_names(task):
             raise HTTPException(404)
         try:
-            file = open_inside(self._jobs.out(task.job), given["path"])
+            file = open_inside(self._jobs.out(task.job), path)
         except FileNotServedError as error:
             raise HTTPException(404) from error
-        kind = TYPES.get(PurePosixPath(given["path"]).suffix, "application/octet-stream")
-        policy = CSP_OF_SITE if given["path"].startswith(SITE) else CSP_OF_RUN
+        kind = TYPES.get(PurePosixPath(path).suffix, "application/octet-stream")
+        policy = CSP_OF_SITE if path.startswith(SITE) else CSP_OF_RUN
         return FileAnswer(file, kind, {**OF_RUN, "content-security-policy": policy})
 
 
@@ -326,12 +333,7 @@ def _encrypted(request: Request) -> bool:
 
 
 async def _limited(request: Request) -> bytes:
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > MAX_JSON_BYTES:
-            raise HTTPException(413, "The request is too large.")
-    return bytes(body)
+    return b"".join([chunk async for chunk in limited(request, MAX_JSON_BYTES)])
 
 
 async def _json(request: Request) -> dict[str, Any]:

@@ -68,6 +68,7 @@ class Job:
         photos: Size and digest of each file, by name.
         options: The options of its tasks.
         outputs: Paths in OUT that make up all.zip; empty for the usual content.
+        title: Name in report and viewer: that of the task that wanted it first; empty for none.
         state: ``new`` until its photos are in place and it is forecast; ``packing`` after its run.
         seed: Key of a job whose artifacts may be reused, because it has the same photos; empty for none.
         forecast: What it needs.
@@ -84,6 +85,7 @@ class Job:
     photos: Mapping[str, FileFacts]
     options: Mapping[str, Any]
     outputs: tuple[str, ...] = ()
+    title: str = ""
     state: JobState = "new"
     seed: str = ""
     forecast: Forecast = NO_FORECAST

@@ -23,6 +23,7 @@ RUN_MODULE = "splatpipe.pipeline.app.cli.main"
 PACK_MODULE = "splatpipe.pipeline.app.node.assets"  # above this room: started, not imported
 BOUNDARY_FILE, OPTIONS_FILE, FORECAST_FILE = "boundary.geojson", "options.toml", "forecast.json"
 MAX_ANSWER_BYTES = 1 << 20
+MAX_TITLE_LETTERS = 200  # as export.title takes it
 
 
 class JobProcess:
@@ -64,6 +65,8 @@ def prepare(job: Job, jobs: JobStore, source: Path) -> None:
 
 def _tables(job: Job, jobs: JobStore, given: RunOptions) -> dict[str, Any]:
     tables: dict[str, Any] = {section: dict(values) for section, values in given.tables.items()}
+    if job.title:
+        tables["export"] = {**tables.get("export", {}), "title": job.title[:MAX_TITLE_LETTERS]}
     files = {"boundary": jobs.path(job.key) / BOUNDARY_FILE if given.boundary else None}
     control = control_file(job.photos)
     files["control"] = jobs.photos(job.key) / control if control is not None else None

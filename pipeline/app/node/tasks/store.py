@@ -182,7 +182,7 @@ class TaskStore:
             self.get(uuid)
             if uuid not in self._uploads:
                 self._uploads[uuid] = UploadFolder(self.path(uuid) / UPLOAD_FOLDER)
-                if self.get(uuid).is_committed:
+                if self.get(uuid).state not in ("uploading", "fetching"):
                     self._uploads[uuid].close()
             return self._uploads[uuid]
 

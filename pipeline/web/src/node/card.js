@@ -34,7 +34,7 @@ export class JobCard {
     this.state = element("p", { class: "state" });
     this.facts = element("p", { class: "small" });
     this.root = element("article", { class: "job", "data-uuid": task.uuid }, element("header", {}, this.heading, this.state, this.facts));
-    for (const name of ["upload", "check", "form", "progress", "trouble", "results", "actions", "log"]) {
+    for (const name of ["upload", "check", "progress", "said", "results", "form", "actions", "log"]) {
       this.panels[name] = element("div", { class: name, hidden: true });
       this.root.append(this.panels[name]);
     }
@@ -51,9 +51,9 @@ export class JobCard {
     this.#draw("upload", task.state === "uploading" && this.#uploadKey(), () => this.#uploadPanel());
     this.#draw("check", (task.state === "uploading" || task.state === "waiting") && (task.check ?? { state: "none" }), () => this.#checkPanel());
     this.#draw("progress", task.state === "running" && [task.progress, task.stage, task.what, Math.round((task.left_s ?? 0) / 20)], () => this.#progressPanel());
-    this.#draw("trouble", (task.message || this.said) && [task.message, task.hint, this.said], () => this.#troublePanel());
+    this.#draw("said", (task.message || this.said) && [task.message, task.hint, this.said], () => this.#saidPanel());
     this.#draw("results", task.results?.length && task.results, () => this.#resultsPanel());
-    this.#draw("form", this.#wantsForm() && "form", () => [this.form().root]);
+    this.#draw("form", this.#wantsForm() && this.task.state, () => [this.task.state === "uploading" ? this.#nameField() : "", this.form().root]);
     this.form_?.forecast(task.check?.forecasts);
     this.#draw("actions", [task.state, this.repeating, task.can, this.upload?.running, this.upload?.complete, task.check?.state, task.check?.verdict], () => this.#actions());
     this.#draw("log", task.state !== "uploading" && "log", () => this.#logPanel());
@@ -70,6 +70,17 @@ export class JobCard {
   form() {
     this.form_ ??= new OptionsForm(this.page.offered, this.task.options ?? []);
     return this.form_;
+  }
+
+  #nameField() {
+    const id = `name-${this.uuid}`;
+    this.name_ ??= element("input", { type: "text", id, maxlength: "200", value: this.task.name, spellcheck: "false" });
+    return element("div", { class: "field" }, element("label", { for: id }, "Name"), this.name_);
+  }
+
+  /** The name that was typed. */
+  get name() {
+    return this.name_?.value.trim() || this.task.name;
   }
 
   #wantsForm() {
@@ -97,7 +108,7 @@ export class JobCard {
     const { state, place, why, check } = this.task;
     if (state === "uploading" && this.upload?.running) return "Uploading";
     if (state === "uploading" && check?.state === "done" && (!this.upload || this.upload.complete)) return "Ready to start";
-    if (state === "waiting") return `${STATES.waiting}${place ? `, number ${place} in the queue` : ""}${why ? `: ${why}` : ""}`;
+    if (state === "waiting") return `${STATES.waiting}${place ? `, number ${place} in the queue` : ""}${why ? `. ${why}` : ""}`;
     if (state === "done" && this.task.verdict) return `Finished: ${this.task.verdict}`;
     return STATES[state] ?? state;
   }
@@ -187,7 +198,7 @@ export class JobCard {
     ];
   }
 
-  #troublePanel() {
+  #saidPanel() {
     const { message, hint } = this.task;
     return [
       message ? element("p", { class: "warning" }, message, hint ? ` ${hint}` : "") : "",
@@ -236,8 +247,10 @@ export class JobCard {
     const pause = can.pause ? [this.#pauseBox()] : [];
     if (this.upload && !this.upload.complete) return [...pause, element("button", { type: "button", class: "first", disabled: true }, "Start")];
     const checked = check?.state === "done";
+    const idle = ["none", "failed", undefined].includes(check?.state);
     const text = !checked ? "Start without the check" : check.verdict === "error" ? "Start all the same" : "Start";
-    return [...pause, button(text, () => this.page.start(this), checked && check.verdict !== "error" ? "first" : "")];
+    const again = idle ? [button("Check", () => this.page.check(this), "first")] : [];
+    return [...pause, ...again, button(text, () => this.page.start(this), checked && check.verdict !== "error" ? "first" : "")];
   }
 
   #pauseBox() {

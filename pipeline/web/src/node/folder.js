@@ -4,6 +4,7 @@ const DEEPEST = 12; // folders below the dropped one: a disk dropped by mistake 
 const MOST_FILES = 50_000;
 const HIDDEN = /(^|\/)[._]/; // as the run leaves them out: .DS_Store, ._DJI_0001.JPG
 const SYSTEM = /(^|\/)(Thumbs\.db|desktop\.ini|__MACOSX)(\/|$)/i;
+const SUBTITLES = "srt"; // beside a film: positions
 const MASK_FOLDER = /(^|\/)masks\//;
 
 /** Thrown where a drop cannot be a capture; the text is for the person. */
@@ -43,21 +44,29 @@ async function walk(entry, above, depth, found, onProgress) {
 /**
  * Sort files into a capture.
  *
- * `accepted` comes from the node: suffixes of photos and names of survey files, with what each is. A node has one folder a
- * job: photos of the same name in several folders get their folder's name in front, and `masks/NAME.png` becomes
- * `NAME_mask.png`, which is what a run calls it beside the photo.
+ * `accepted` comes from the node: suffixes of photos, raws and films, and names of survey files with what each is. A node
+ * has one folder a job: photos of the same name in several folders get their folder's name in front, and
+ * `masks/NAME.png` becomes `NAME_mask.png`, which is what a run calls it beside the photo. Raws of photos that are there
+ * are left out; so are films, unless the drop is one film.
  */
 export function capture(found, accepted) {
   const seen = found.filter(({ path }) => !HIDDEN.test(path) && !SYSTEM.test(path));
   const root = sharedFolder(seen.map(({ path }) => path));
-  const photos = [], inMasks = [], survey = [], others = [];
+  const photos = [], raws = [], films = [], inMasks = [], survey = [], others = [];
   for (const { path, file } of seen) {
     const name = path.slice(root.length);
     const base = name.split("/").at(-1).toLowerCase();
+    const suffix = suffixOf(base);
     if (accepted.survey[base]) survey.push({ name: base, file, what: accepted.survey[base] });
-    else if (!accepted.photos.includes(suffixOf(base))) others.push({ name, file });
+    else if (accepted.raws.includes(suffix)) raws.push({ name, file });
+    else if (accepted.films.includes(suffix) || suffix === SUBTITLES) films.push({ name, file });
+    else if (!accepted.photos.includes(suffix)) others.push({ name, file });
     else (MASK_FOLDER.test(name) ? inMasks : photos).push({ name, file });
   }
+  const developed = new Set(photos.map(({ name }) => stemOf(name)));
+  for (const raw of raws) (developed.has(stemOf(raw.name)) ? others : photos).push(raw);
+  const isFilm = !photos.length && films.filter(({ name }) => suffixOf(name.toLowerCase()) !== SUBTITLES).length === 1;
+  for (const film of films) (isFilm ? photos : others).push(film);
   flatten(photos);
   const owners = ownersOf(photos);
   const masks = inMasks.filter((mask) => named(mask, owners) || !others.push(mask));

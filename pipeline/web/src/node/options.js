@@ -8,6 +8,24 @@ const PRESETS = {
   standard: "For most work: all products.",
   high: "The most detail; takes several times as long.",
 };
+// The other options in words; their names are OpenDroneMap's.
+const LABELS = {
+  dsm: "Surface model (DSM)",
+  dtm: "Terrain model (DTM)",
+  "orthophoto-resolution": "Pixel size of the orthophoto, cm",
+  "dem-resolution": "Cell size of DSM and DTM, cm",
+  "fast-orthophoto": "Orthophoto only, without a splat",
+  "pc-quality": "Quality of depths",
+  "feature-quality": "Quality of keypoints",
+  mesh: "Textured mesh",
+  "mesh-size": "Most triangles of the mesh",
+  facades: "Façades",
+  boundary: "Boundary (GeoJSON)",
+  vertical: "Vertical datum",
+  "check-points": "Check points",
+  "time-budget": "Time budget",
+  sky: "Sky",
+};
 const FEATURED = ["preset", "crs"];
 const CRS_FORM = "(EPSG:\\s*)?\\d{3,6}(\\+\\d{3,6})?|\\+proj=.+|WGS84 UTM \\d{1,2}[NSns]|[Gg][Cc][Pp]|auto";
 let forms = 0;
@@ -40,7 +58,7 @@ export class OptionsForm {
       const place = this.forecasts.get(each.preset);
       if (!place) continue;
       place.replaceChildren(`about ${roughly(each.seconds)}, ${size(each.memory_bytes)} of memory, ${size(each.disk_bytes)} of disk`);
-      if (each.lacking) place.append(element("strong", { class: "lacking" }, ` This machine lacks ${each.lacking}.`));
+      if (each.lacking) place.append(element("strong", { class: "lacking" }, ` It needs ${each.lacking}.`));
     }
   }
 
@@ -87,8 +105,8 @@ export class OptionsForm {
   #field(option) {
     const id = `${this.id}-${option.name}`;
     const value = this.chosen.get(option.name);
-    const help = element("p", { class: "small", id: `${id}-help` }, option.help.replaceAll("%(default)s", option.value).replaceAll("%(choices)s", [].concat(option.domain).join(", ")));
-    const label = element("label", { for: id }, option.name.replaceAll("-", " "));
+    const help = element("p", { class: "small", id: `${id}-help` }, option.help.split(/ (?:Can be one of|Default): /)[0]);
+    const label = element("label", { for: id }, LABELS[option.name] ?? option.name.replaceAll("-", " "));
     const described = { id, "aria-describedby": `${id}-help` };
     if (option.type === "bool") {
       const input = element("input", { type: "checkbox", ...described });

@@ -1,10 +1,14 @@
 """Records of tasks and jobs: atomic, read again by the next process, and one job for equal tasks."""
 
+import io
 import json
+import zipfile
 from pathlib import Path
 
 import pytest
+from timeouts import wait_until
 
+from splatpipe.pipeline.app.node.tasks import node as node_module
 from splatpipe.pipeline.app.node.tasks import store as store_module
 from splatpipe.pipeline.app.node.tasks.jobs import JobStore, job_key, seed_artifacts
 from splatpipe.pipeline.app.node.tasks.node import NewTask, Node
@@ -233,3 +237,23 @@ def test_names_of_the_host_are_not_in_a_log(node: Node) -> None:
     node.jobs.output(task.job).write_text(f"wrote {node.jobs.out(task.job)}/dsm.tif\nsee /home/mia/acme/log.txt\n")
     lines = node.lines(node.tasks.get(task.uuid))
     assert lines == ["wrote OUT/dsm.tif", "see log.txt"]
+
+
+def test_a_zip_is_fetched_unpacked_and_queued_or_the_task_fails_with_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = Node(Settings(tmp_path, least_free_bytes=0), ["files.example"])
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("photos/a.jpg", b"one")
+        archive.writestr("readme.md", b"x")
+    content = {"good": file.getvalue(), "bad": b"no zip"}
+    monkeypatch.setattr(node_module, "fetch", lambda parts, write, _most: write(content[parts.path.removeprefix("/")]))
+    ended = {}
+    for name in content:
+        task = node.commit(node.create(NewTask(zip_url=f"http://files.example/{name}")).uuid)
+        assert node.info(task)["status"] == {"code": QUEUED}
+        ended[name] = wait_until(lambda uuid=task.uuid: (t := node.tasks.get(uuid)).state != "fetching" and t)
+    assert (ended["good"].state, ended["good"].images) == ("wanted", 1) and "readme.md" in ended["good"].notes[0]
+    assert ended["bad"].state == "failed" and "zip" in ended["bad"].error
+    assert not list(tmp_path.rglob("fetched.zip"))
