@@ -45,7 +45,7 @@ class FinishedRun:
         if path.is_symlink() or path.exists():
             return f"the one in OUT is {'a link' if path.is_symlink() else 'of an earlier run'}"
         if history is not None and history.state == "failed":
-            return f"its stage {place.stage} failed: {history.message or 'see the log'}"
+            return f"its stage {place.stage} failed: {history.message.rstrip('.') or 'see the log'}"
         if place.stage not in self.inputs.artifacts:
             return f"the run ended before its stage {place.stage}"
         warnings = [] if history is None else [text for text, _ in history.messages.warnings]
