@@ -188,7 +188,8 @@ def check_cloud(path: Path, root: Path, base: Map | None) -> Iterator[Check]:
             for number, count in zip(*np.unique(np.asarray(chunk.classification), return_counts=True), strict=True):
                 classes[int(number)] = classes.get(int(number), 0) + int(count)
             apart.append(_over_surface(root, np.stack([chunk.x, chunk.y, chunk.z], axis=1)))
-    yield Check("the cloud has classes", str(classes), sum(classes.values()) > 0)
+    ground = (root / RASTERS["dtm.tif"]).is_file()  # what the cloud's classes are made with
+    yield Check("the cloud has classes where there is a terrain model", str(classes), (2 in classes) == ground)
     if base is None:
         return
     same = crs is not None and horizontal(crs).equals(base.crs, ignore_axis_order=True)
@@ -206,7 +207,8 @@ def _over_surface(root: Path, points: Array) -> Array:
     if not path.is_file():
         return np.zeros(0)
     with rasterio.open(path) as raster:
-        columns, rows = (~raster.transform) * (points[:, 0], points[:, 1])
+        place = raster.transform
+        columns, rows = (points[:, 0] - place.c) / place.a, (points[:, 1] - place.f) / place.e
         heights = raster.read(1, masked=True).filled(np.nan)
     rows, columns = np.floor(rows).astype(int), np.floor(columns).astype(int)
     inside = (rows >= 0) & (columns >= 0) & (rows < heights.shape[0]) & (columns < heights.shape[1])

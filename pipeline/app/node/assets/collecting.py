@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatpipe.pipeline.app.node.assets.archive import Entry
+from splatpipe.pipeline.app.node.assets.clouds import CloudFacts, UnusableCloud, check_cloud
 from splatpipe.pipeline.app.node.assets.control_points import control_geojson
 from splatpipe.pipeline.app.node.assets.earth import Earth
 from splatpipe.pipeline.app.node.assets.finished_run import NOT_ASKED_FOR, FinishedRun
@@ -15,6 +16,7 @@ from splatpipe.pipeline.app.node.assets.geo_glb import UnusableMesh, plan_centre
 from splatpipe.pipeline.app.node.assets.geo_obj import write_geo_obj
 from splatpipe.pipeline.app.node.assets.layout import (
     CAMERAS,
+    CLOUD,
     CONTROL,
     GLB,
     MATERIALS,
@@ -31,7 +33,13 @@ from splatpipe.pipeline.app.node.assets.layout import (
     is_safe,
 )
 from splatpipe.pipeline.app.node.assets.outputs import chosen
-from splatpipe.pipeline.app.node.assets.rasters import UnplacedRaster, UnusableRaster, check_raster, write_picture
+from splatpipe.pipeline.app.node.assets.rasters import (
+    UnplacedRaster,
+    UnusableRaster,
+    check_map_tiles,
+    check_raster,
+    write_picture,
+)
 from splatpipe.pipeline.app.node.assets.shots import Flight, cameras_json, read_flight, shots_geojson
 from splatpipe.pipeline.app.node.assets.statistics import run_statistics
 from splatpipe.pipeline.engine.files.json_file import json_text
@@ -96,14 +104,15 @@ class _Collector:
         self._outputs = outputs
         self._packed: set[str] = set()  # paths in OUT that have a place
         self._broken: set[str] = set()
+        self._cloud: CloudFacts | None = None
 
     def add_place(self, place: Place) -> None:
-        """Add a product that is packed as it is, after a look at it if it is a map."""
+        """Add a product that is packed as it is, after a look at it if it is a map or a cloud."""
         if place.source.endswith("/"):
             found = [name for name in self.run.files if name.startswith(place.source)]
         else:
             found = [name for name in (place.source,) if name in self.run.files]
-        if place.raster and found and self._is_left_out(place):
+        if place.kind and found and self._is_left_out(place):
             return
         for name in found:
             self._add_file(place.entry + name[len(place.source) :], name)
@@ -168,8 +177,7 @@ class _Collector:
         inputs, earth = self.run.inputs, self.run.earth
         ingested = inputs.part("ingest.photos")
         photos = [] if ingested is None else inputs.read_in_part("ingest.photos", "photos.json").get("photos", [])
-        cloud = self.run.files.get("cloud.laz")
-        self._add_json(STATISTICS, run_statistics(inputs, cloud, photos))
+        self._add_json(STATISTICS, run_statistics(inputs, self._cloud, photos))
         try:
             flight = self._flight()
         except (OSError, ValueError) as error:
@@ -194,18 +202,28 @@ class _Collector:
         return None if model is None or self.run.inputs.part("georef.frame") is None else read_flight(model)
 
     def _is_left_out(self, place: Place) -> bool:
-        """Whether WebODM could not open a map; one that is whole is packed under its own name."""
+        """Whether clients could not open a product; a map without a place on the earth is packed under its own name."""
         try:
-            check_raster(self.run.files[place.source], colours=place is ORTHO_PLACE)
+            self._open(place)
         except UnplacedRaster as error:
             self._add_file(place.source, place.source)
             self._lacks(place.entry, place.what, f"{error}; it is there as {place.source}")
             return True
-        except UnusableRaster as error:
+        except (UnusableRaster, UnusableCloud) as error:
             self._broken.add(place.source)
             self._lacks(place.entry, place.what, str(error))
             return True
         return False
+
+    def _open(self, place: Place) -> None:
+        path = self.run.files[place.source]
+        if place.kind == "map":
+            check_raster(path, colours=place is ORTHO_PLACE)
+        elif place.kind == "tiles":
+            check_map_tiles(path)
+        else:
+            facts = check_cloud(path)
+            self._cloud = facts if place.entry == CLOUD else self._cloud
 
     def _is_wanted(self, entry: str) -> bool:
         return bool(chosen([entry], self._outputs))

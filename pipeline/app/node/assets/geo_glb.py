@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.app.node.assets.earth import Earth
-from splatpipe.pipeline.delivery.sparse_scene import GLTF_FROM_WORLD
 from splatpipe.pipeline.engine.files.json_file import parse_json
 from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.engine.files.small_file import open_regular
@@ -33,6 +32,7 @@ VERTICES_AT_ONCE = 1 << 17
 VERTEX_BYTES = 12
 COPY_BYTES = 1 << 20
 RTC = "CESIUM_RTC"
+LOCAL_FROM_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # +Y up to +Z up
 
 
 class UnusableMesh(Exception):
@@ -73,7 +73,7 @@ def plan_centre(earth: Earth, source: Path) -> tuple[float, float, float]:
         document, _, _ = _read_head(file)
     _positions(document)
     corners = [document["accessors"][each][end] for each in _accessors(document) for end in ("min", "max")]
-    box = np.array(corners, np.float64).reshape(-1, 3) @ GLTF_FROM_WORLD
+    box = np.array(corners, np.float64).reshape(-1, 3) @ LOCAL_FROM_GLTF.T
     if not len(box) or not np.isfinite(box).all():
         raise UnusableMesh("it has no vertices")
     middle = (box.min(axis=0) + box.max(axis=0)) / 2.0
@@ -181,7 +181,7 @@ def _move(
     """Write vertices in the CRS, and their bounds into their accessor."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for batch in _batches(file, count):
-        there = earth.crs.crs_from_local(batch @ GLTF_FROM_WORLD) - centre
+        there = earth.crs.crs_from_local(batch @ LOCAL_FROM_GLTF.T) - centre
         if not np.isfinite(there).all():
             raise UnusableMesh("it has vertices that are no numbers")
         written = np.ascontiguousarray(there, "<f4")

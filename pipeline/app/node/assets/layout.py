@@ -6,6 +6,7 @@ Paths and names are ODM's, as WebODM reads them. What ODM does not have keeps it
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 ALL = "all.zip"
 MAX_PATH_LETTERS = 1024
@@ -35,7 +36,7 @@ class Place:
         entry: Its path in `all.zip`; likewise.
         stage: The stage that makes it; empty for what is written after the stages.
         format: Its name in the stage's option `formats`; empty if the stage has the option `enabled` instead, or none.
-        raster: Whether it is a map that WebODM opens.
+        kind: What it must be to be packed: a map, map tiles or a point cloud that opens; empty for no matter what.
     """
 
     what: str
@@ -43,24 +44,24 @@ class Place:
     entry: str
     stage: str = ""
     format: str = ""
-    raster: bool = False
+    kind: Literal["", "map", "tiles", "cloud"] = ""
 
 
-ORTHO_PLACE = Place("orthophoto", "ortho.tif", ORTHO, "ortho", raster=True)
+ORTHO_PLACE = Place("orthophoto", "ortho.tif", ORTHO, "ortho", kind="map")
 MESH_PLACE = Place("textured mesh", "mesh/mesh.glb", GLB, "mesh")
 PLACES = (
     ORTHO_PLACE,
-    Place("orthophoto's map tiles", "export/ortho.mbtiles", f"{ORTHO[:-3]}mbtiles", "publish", "mbtiles"),
-    Place("surface model", "dsm.tif", "odm_dem/dsm.tif", "dsm", raster=True),
-    Place("terrain model", "dtm.tif", "odm_dem/dtm.tif", "dtm", raster=True),
-    Place("surface model's accuracy", "dsm_confidence.tif", "odm_dem/dsm_confidence.tif", "dsm"),
-    Place("terrain model's accuracy", "dtm_confidence.tif", "odm_dem/dtm_confidence.tif", "dtm"),
-    Place("heights over the ground", "chm.tif", "odm_dem/chm.tif", "dtm"),
-    Place("surface model's map tiles", "export/dsm.mbtiles", "odm_dem/dsm.mbtiles", "publish", "mbtiles"),
+    Place("orthophoto's map tiles", "export/ortho.mbtiles", f"{ORTHO[:-3]}mbtiles", "publish", "mbtiles", "tiles"),
+    Place("surface model", "dsm.tif", "odm_dem/dsm.tif", "dsm", kind="map"),
+    Place("terrain model", "dtm.tif", "odm_dem/dtm.tif", "dtm", kind="map"),
+    Place("surface model's accuracy", "dsm_confidence.tif", "odm_dem/dsm_confidence.tif", "dsm", kind="map"),
+    Place("terrain model's accuracy", "dtm_confidence.tif", "odm_dem/dtm_confidence.tif", "dtm", kind="map"),
+    Place("heights over the ground", "chm.tif", "odm_dem/chm.tif", "dtm", kind="map"),
+    Place("surface model's map tiles", "export/dsm.mbtiles", "odm_dem/dsm.mbtiles", "publish", "mbtiles", "tiles"),
     Place("contours as GeoJSON", "contours.geojson", "contours/contours.geojson", "dtm"),
     Place("contours as DXF", "contours.dxf", "contours/contours.dxf", "dtm"),
-    Place("point cloud", "cloud.laz", CLOUD, "cloud"),
-    Place("point cloud in levels", "export/cloud.copc.laz", f"{CLOUD[:-3]}copc.laz", "publish", "copc"),
+    Place("point cloud", "cloud.laz", CLOUD, "cloud", kind="cloud"),
+    Place("point cloud in levels", "export/cloud.copc.laz", f"{CLOUD[:-3]}copc.laz", "publish", "copc", "cloud"),
     Place("mesh's 3D Tiles", "export/mesh-tiles/", "3d_tiles/model/", "publish", "mesh-tiles"),
     Place("splat's 3D Tiles", "export/tiles/", "3d_tiles/splat/", "export", "tiles"),
     Place("splat", "splat.ply", "splat.ply", "export"),

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 
-import laspy
 import numpy as np
 from jaxtyping import Float64
 
+from splatpipe.pipeline.app.node.assets.clouds import CloudFacts
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 
 DATE = "%d/%m/%Y at %H:%M:%S"  # as in OpenSfM's statistics
@@ -18,12 +17,14 @@ DIGITS = 4  # of metres and centimetres
 AXES = ("x", "y", "z")
 
 
-def run_statistics(inputs: ReportInputs, cloud: Path | None, photos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def run_statistics(
+    inputs: ReportInputs, cloud: CloudFacts | None, photos: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
     """`stats.json`.
 
     Args:
         inputs: The run.
-        cloud: `cloud.laz`; None if there is none.
+        cloud: Facts of `cloud.laz`; None if there is none.
         photos: The checked photos, of `ingest.photos`.
 
     Raises:
@@ -75,14 +76,11 @@ def _date(text: str) -> str:
         return text
 
 
-def _cloud(path: Path | None) -> dict[str, Any]:
-    if path is None:
+def _cloud(cloud: CloudFacts | None) -> dict[str, Any]:
+    if cloud is None:
         return {"dense": False, "stats": {"statistic": []}}
-    with laspy.open(path) as file:
-        header = file.header
-        bounds = zip("XYZ", header.mins.tolist(), header.maxs.tolist(), strict=True)
-        count = int(header.point_count)
-    listed = [{"name": name, "count": count, "minimum": low, "maximum": high} for name, low, high in bounds]
+    bounds = zip("XYZ", *cloud.box.tolist(), strict=True)
+    listed = [{"name": name, "count": cloud.count, "minimum": low, "maximum": high} for name, low, high in bounds]
     return {"dense": True, "stats": {"statistic": listed}}
 
 

@@ -1,7 +1,10 @@
-"""Maps on their way to WebODM: only what opens is packed; the orthophoto as a picture."""
+"""Maps and clouds on their way to WebODM: only what opens is packed; the orthophoto as a picture."""
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 import rasterio
@@ -9,8 +12,10 @@ from hills import hill_grid, placed, write_hill
 from PIL import Image
 
 from splatpipe.pipeline.app.node.assets import rasters
-from splatpipe.pipeline.app.node.assets.rasters import UnusableRaster, check_raster, write_picture
+from splatpipe.pipeline.app.node.assets.clouds import UnusableCloud, check_cloud
+from splatpipe.pipeline.app.node.assets.rasters import UnusableRaster, check_map_tiles, check_raster, write_picture
 from splatpipe.pipeline.geometry.similarity import Similarity
+from splatpipe.pipeline.surface.levels.map_tiles import write_ortho_tiles
 from splatpipe.pipeline.surface.rasters.geotiff import COLOURS, raster_file
 from splatpipe.pipeline.surface.rasters.grid import Grid
 from splatpipe.pipeline.survey.crs.frames import Frame
@@ -81,3 +86,32 @@ def test_the_picture_has_the_orthophotos_colours_and_transparency(
 def test_a_compound_crs_is_on_the_earth(tmp_path: Path) -> None:
     write_hill(tmp_path / "dsm.tif", hill_grid(placed("EPSG:25832+7837")))
     check_raster(tmp_path / "dsm.tif", colours=False)
+
+
+def test_map_tiles_are_opened(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "ortho.mbtiles"
+    write_ortho_tiles(folder / "ortho.tif", path, placed(), lambda done, total: None)
+    check_map_tiles(path)
+    with closing(sqlite3.connect(path)) as tiles, tiles:
+        tiles.execute("DELETE FROM tiles")
+    with pytest.raises(UnusableRaster, match="no tiles"):
+        check_map_tiles(path)
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(UnusableRaster, match="cannot be read"):
+        check_map_tiles(path)
+
+
+def test_clouds_are_opened(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.laz"
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales, header.offsets = [0.001] * 3, [5e5, 5e6, 0.0]
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = (np.arange(5000) * 0.01 + start for start in (5e5, 5e6, 100.0))
+    cloud.write(path)
+    facts = check_cloud(path)
+    assert facts.count == 5000 and facts.box[:, 2] == pytest.approx([100.0, 149.99])
+    whole = path.read_bytes()
+    for data in (b"", whole[:100], whole[:500], whole[:375] + b"\xff" * 200, b"LASF" + b"\xff" * 1000):
+        path.write_bytes(data)
+        with pytest.raises(UnusableCloud):
+            check_cloud(path)
