@@ -42,6 +42,7 @@ from splatpipe.pipeline.app.node.tasks.settings import (
 from splatpipe.pipeline.app.node.tasks.store import TaskStore, UnknownTaskError, now_ms
 from splatpipe.pipeline.app.node.tasks.uploads import NameTakenError, PartFile
 from splatpipe.pipeline.app.node.tasks.zip_upload import BadZipError, unpack
+from splatpipe.pipeline.engine.files.output_file import new_file
 
 UUID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}", re.IGNORECASE)
 MAX_NAME_LETTERS = 255
@@ -208,7 +209,7 @@ class Node:
         if upload.count() >= MAX_FILES:
             raise RefusedTaskError(f"A task has at most {MAX_FILES:,} files.")
         self.reserve(0)
-        self.tasks.touch(uuid)
+        self.tasks.keep_open(uuid)
         return upload.begin(name)
 
     def limit_of(self, name: str) -> int:
@@ -332,7 +333,7 @@ class Node:
         for attempt in range(FETCH_TRIES):
             try:
                 parts = self._hosts.check(task.zip_url)
-                with place.open("wb") as file:
+                with new_file(place) as file:
 
                     def write(block: bytes, into: Any = file) -> None:
                         self.reserve(len(block))

@@ -166,7 +166,7 @@ class TaskStore:
             if line not in notes and len(notes) < most:
                 self.change(uuid, later=True, notes=(*notes, line))
 
-    def touch(self, uuid: str) -> None:
+    def keep_open(self, uuid: str) -> None:
         """Note that a client works on a task, in memory only."""
         with self._lock:
             if uuid in self._tasks:
