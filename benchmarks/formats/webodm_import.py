@@ -163,7 +163,7 @@ class WebOdm:
             raise TaskFailure(f"{request.full_url}: {error.code}") from error
         except urllib.error.URLError as error:
             if isinstance(error.reason, ConnectionRefusedError | ConnectionResetError):
-                raise ConnectionRefusedError from error
+                raise ConnectionRefusedError(f"{request.full_url}: nobody listens") from error
             raise TaskFailure(f"{request.full_url}: {error.reason}") from error
         except TimeoutError as error:
             raise TaskFailure(f"{request.full_url}: no answer within {limit_s:.0f} s") from error
@@ -251,7 +251,7 @@ def main() -> str | None:
         folder = Path(name)
         try:
             checks = _checks(arguments, folder)
-        except (ImportFailure, TaskFailure) as error:
+        except (ImportFailure, TaskFailure, OSError) as error:
             return f"WebODM gives up: {error}"
     for line in told(checks):
         print(line)
