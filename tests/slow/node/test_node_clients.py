@@ -114,7 +114,9 @@ def test_ranges_have_exactly_the_bytes_that_were_asked_for(node: Node, finished:
         connection = http.client.HTTPConnection(HOST, node.port)
         connection.request(method, f"/task/{finished.uuid}/download/{asset}", headers=headers)
         response = connection.getresponse()
-        return response, response.read()
+        data = response.read()
+        connection.close()
+        return response, data
 
     for asset in ("all.zip", "report.html"):
         response, whole = get(asset)
