@@ -31,7 +31,7 @@ class Packed(NamedTuple):
 @pytest.fixture(scope="module")
 def packed(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Packed:
     folder = tmp_path_factory.mktemp("task")
-    (folder / "log").write_text("first line\nlast line", encoding="utf-8")
+    (folder / "log").write_text(f"first line\n{demo_run}/dsm.tif  2 MB\n/home/anna/x.jpg", encoding="utf-8")
     return Packed(folder / "all.zip", pack_run(demo_run, folder / "all.zip", (), folder / "log"))
 
 
@@ -55,7 +55,7 @@ def test_it_has_what_the_run_made_and_names_the_rest(packed: Packed, demo_run: P
     with zipfile.ZipFile(packed.path) as archive:
         log = archive.read("task_output.txt").decode()
         assert archive.read("splat.ply") == (demo_run / "splat.ply").read_bytes()
-    assert log.splitlines() == ["first line", "last line", *packed.facts.lines]
+    assert log.splitlines() == ["first line", "OUT/dsm.tif  2 MB", "x.jpg", *packed.facts.lines]
 
 
 def test_every_single_file_is_the_one_in_it(packed: Packed) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,9 +15,10 @@ from splatpipe.pipeline.app.node.assets.outputs import chosen, unmatched
 from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.engine.files.durable import whole_file
-from splatpipe.pipeline.engine.files.small_file import open_regular
+from splatpipe.pipeline.engine.files.small_file import read_end
+from splatpipe.pipeline.engine.files.text_lines import text_lines
 
-MAX_LOG_BYTES = 64 << 20  # the end of a longer log is packed
+MAX_LOG_BYTES = 8 << 20  # the end of a longer log is packed
 SPARE_BYTES = 64 << 20  # of the disk: for what else is written meanwhile
 
 
@@ -62,7 +62,7 @@ def pack_run(out: Path, target: Path, outputs: Sequence[str] = (), log: Path | N
         lines = tuple(" ".join(labels.plain(line).split()) for line in _lines(contents, outputs))
         entries = [contents.entries[name] for name in chosen(contents.entries, outputs)]
         if not outputs or LOG in chosen([LOG], outputs) or _top_level(entries) < 2:  # WebODM unwraps a lone folder
-            entries.append(Entry(LOG, _log(log, lines)))
+            entries.append(Entry(LOG, _log(log, labels, lines)))
         _require_room(aside.parent, entries)
         write_archive(aside, entries)
         size = aside.stat().st_size
@@ -81,16 +81,11 @@ def _top_level(entries: Sequence[Entry]) -> int:
     return len({entry.name.partition("/")[0] for entry in entries})
 
 
-def _log(path: Path | None, lines: Sequence[str]) -> bytes:
-    """The task's log with the lines of the packing behind it."""
-    before = b""
-    if path is not None:
-        with open_regular(path) as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - MAX_LOG_BYTES))
-            before = file.read(MAX_LOG_BYTES)
-    if before and not before.endswith(b"\n"):
-        before += b"\n"
-    return before + "".join(f"{line}\n" for line in lines).encode()
+def _log(path: Path | None, labels: PathLabels, lines: Sequence[str]) -> bytes:
+    """The task's log without this machine's folders, and the lines of the packing behind it."""
+    before = b"" if path is None else read_end(path, MAX_LOG_BYTES)
+    said = [labels.plain(line.rstrip()) for line in text_lines(before.decode("utf-8", "replace"))]
+    return "".join(f"{line}\n" for line in (*said, *lines)).encode()
 
 
 def _require_room(folder: Path, entries: Sequence[Entry]) -> None:
