@@ -34,6 +34,7 @@ def test_pictures_of_users_are_opened_in_one_place() -> None:
         "pipeline/photos/files/picture_file.py",
         "pipeline/app/preflight/sizing.py",  # reads headers only
         "pipeline/splat/containers/lossless_pictures.py",  # has limits of its own
+        "pipeline/app/node/assets/rasters.py",  # a picture of our own, checked after it was written
     }
 
 
