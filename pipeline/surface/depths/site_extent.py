@@ -27,8 +27,6 @@ MAX_CELLS = 1 << 24  # largest plan: 60 km² at a GSD of 2 cm, and 0.5 GB
 MIN_PHOTOS = 3  # photos that have to see a cell
 MAX_PIXEL_TIMES = 4.0  # times the usual size on the ground: larger pixels show distant land, not the site
 MAX_LEVEL_TIMES = 2.0  # likewise across the ray, for level photos: a flight straight down reaches as far
-    2.0  # the same across the ray for level photos, which show façades: as far from a flight straight down
-)
 LEVEL_SINE = 0.17  # a photo is level if its axis is at most 10° below the horizon
 MIN_PART_SHARE = 0.02  # share of the area seen below which an isolated part is left out
 OUTLIER_SHARE = 0.001  # share of the lowest and of the highest samples that may be wrong
