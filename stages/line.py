@@ -283,7 +283,7 @@ SURFACE_READS = (
 )
 DSM = Stage(
     "dsm",
-    version=3,
+    version=4,
     config=DsmConfig,
     reads=SURFACE_READS,
     parts={"files": "files", "site": "site.json"},

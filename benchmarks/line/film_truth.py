@@ -115,12 +115,16 @@ def write_film(path: Path, flight: Flight, gaussians: Gaussians, options: Render
     began_s = time.process_time()
     words = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     words += ["-s", f"{flight.width}x{flight.height}", "-r", str(flight.fps), "-i", "-", "-c:v", "libx264"]
-    words += ["-b:v", rate, "-g", str(flight.fps), "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path)]
+    whole = path.with_name(f"partial-{path.name}")
+    words += ["-b:v", rate, "-g", str(flight.fps), "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(whole)]
     with subprocess.Popen(words, stdin=subprocess.PIPE) as encoder:
         assert encoder.stdin is not None
         for frame in range(flight.frames):
             encoder.stdin.write(frame_of(flight, gaussians, options, frame / flight.fps).tobytes())
         encoder.stdin.close()
+    if encoder.returncode:
+        raise SystemExit(f"ffmpeg failed with {encoder.returncode}")
+    whole.rename(path)
     return (time.process_time() - began_s) / flight.frames
 
 
@@ -210,7 +214,7 @@ def main() -> None:
     if not film.exists():
         with torch.no_grad():
             print(f"drawn in {write_film(film, flight, gaussians, rendering, options.rate):.2f} CPU seconds a frame")
-        write_subtitles(film.with_suffix(".SRT"), flight)
+    write_subtitles(film.with_suffix(".SRT"), flight)
     stills, outs = (
         options.work / f"{film.stem}-stills",
         [options.work / f"{film.stem}-{kind}" for kind in ("film", "still")],

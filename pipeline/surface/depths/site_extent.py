@@ -26,6 +26,8 @@ CELL_GSD = 100.0  # plan cell size in GSDs, such that each cell that a photo see
 MAX_CELLS = 1 << 24  # largest plan: 60 km² at a GSD of 2 cm, and 0.5 GB
 MIN_PHOTOS = 3  # photos that have to see a cell
 MAX_PIXEL_TIMES = 4.0  # times the usual size on the ground: larger pixels show distant land, not the site
+MAX_LEVEL_TIMES = 2.0  # likewise across the ray, for level photos: a flight straight down reaches as far
+LEVEL_SINE = 0.17  # a photo is level if its axis is at most 10° below the horizon
 MIN_PART_SHARE = 0.02  # share of the area seen below which an isolated part is left out
 OUTLIER_SHARE = 0.001  # share of the lowest and of the highest samples that may be wrong
 RELIEF_MARGIN_SHARE = 0.1  # share of the relief added below and above, for what the samples missed,
@@ -129,7 +131,7 @@ def measure_extent(
     gsd = float(np.mean([np.median(sample[:, 4]) for sample in seen]))
     number = np.repeat(np.arange(len(samples)), [len(sample) for sample in samples])
     every = np.concatenate(samples)
-    near = every[:, 3] <= MAX_PIXEL_TIMES * gsd
+    near = every[:, 3] <= gsd
     if area is not None:
         near &= area.contains(every[:, :3])
     every, number = every[near], number[near]
@@ -150,7 +152,7 @@ def measure_extent(
 
 
 def _sample_depths(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 5"]:
-    """East, north, up of sampled depths, and the pixel size there: on the ground, and across the ray."""
+    """East, north, up of sampled depths, the pixel size by which they are near, over its limit, and across the ray."""
     found: PosedDepthMap = source.load()
     camera = found.camera
     step = max(1, round((camera.width * camera.height / SAMPLES) ** 0.5))
@@ -162,7 +164,9 @@ def _sample_depths(finer: float, source: DepthSource) -> Float64[np.ndarray, "n 
     away = np.linalg.norm(points - camera.centre(), axis=1)
     sine = (camera.centre()[2] - points[:, 2]) / np.maximum(away, 1e-9)
     pixel = depth / max(camera.fx, camera.fy) / finer
-    return np.column_stack([points, pixel / np.maximum(sine, 1e-3), pixel])
+    is_level = float(camera.cam_from_world[2, 2]) >= -LEVEL_SINE
+    size = pixel / MAX_LEVEL_TIMES if is_level else pixel / np.maximum(sine, 1e-3) / MAX_PIXEL_TIMES
+    return np.column_stack([points, size, pixel])
 
 
 def _covered(cell: Int64[np.ndarray, "n 2"], number: Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "rows columns"]:

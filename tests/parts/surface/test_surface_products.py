@@ -16,6 +16,7 @@ from house_site import cameras, depths_of, edge_distance, photo_of, true_height,
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.engine.stage import Inputs, Machine
+from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface.depths import site_extent as site_survey
@@ -137,6 +138,23 @@ def test_a_site_ends_at_its_boundary() -> None:
     found = measure_extent(sources(), 1.0, HOUSE, 1)
     assert found is not None
     assert np.abs(found.reach).max() <= 5.5
+
+
+def test_level_photos_show_a_facade_up_to_its_eaves_and_nothing_far_behind_it() -> None:
+    """Five photos from eye height, 12 m before a wall of 20 by 10 m; what is beside it lies 60 m behind."""
+    east, up = np.meshgrid((np.arange(100) + 0.5 - 50.0) / 50.0, (50.0 - np.arange(100) - 0.5) / 50.0)
+
+    def facing_north(x: float) -> DepthSource:
+        pose = np.array([[1.0, 0.0, 0.0, -x], [0.0, 0.0, -1.0, 1.7], [0.0, 1.0, 0.0, 12.0], [0.0, 0.0, 0.0, 1.0]])
+        camera = Camera(f"{x}", 100, 100, 50.0, 50.0, 50.0, 50.0, pose)
+        depth = np.where((np.abs(x + 12.0 * east) < 10.0) & (1.7 + 12.0 * up < 10.0), 12.0, 72.0).astype(np.float32)
+        return DepthSource(camera, lambda: MetricMap(camera, depth, np.full(depth.shape, 5, np.uint8)))
+
+    found = measure_extent([facing_north(x) for x in (-6.0, -3.0, 0.0, 3.0, 6.0)], 1.0, None, 1)
+    assert found is not None
+    assert found.sees(np.array([[-9.5, -0.1], [-8.5, 0.1]]))
+    assert found.reach[3] < 1.0
+    assert 9.0 < found.high_m < 14.0
 
 
 def test_depths_too_far_apart_for_a_site_are_refused() -> None:
