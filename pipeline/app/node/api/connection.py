@@ -17,6 +17,7 @@ from splatpipe.pipeline.app.serving.connection import longest_waiting
 HEAD_S = 20.0  # for a request's head; also how long an idle connection is kept
 PERIOD_S = 30.0
 LEAST_BYTES = 8 << 10  # of a body in each period: a line of 3 kbit/s
+UNREAD_PERIODS = 10  # without a byte of the answer being read
 MAX_CONNECTIONS = 512  # 30 clients with ten threads, and room for polls
 
 
@@ -26,6 +27,7 @@ class NodeConnection(H11Protocol):
     _timer: asyncio.TimerHandle | None = None
     _period_bytes = 0
     _unread = 0  # bytes of the answer that wait for the client
+    _unread_periods = 0
     since_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -74,7 +76,8 @@ class NodeConnection(H11Protocol):
         """Close a connection that does not move; called at the end of each period."""
         state = self.conn.their_state
         unread = self.transport.get_write_buffer_size() if self.flow.write_paused else 0
-        stuck = state is h11.IDLE or (unread and unread == self._unread)
+        self._unread_periods = self._unread_periods + 1 if unread and unread == self._unread else 0
+        stuck = state is h11.IDLE or self._unread_periods >= UNREAD_PERIODS
         if state is h11.SEND_BODY and not self.flow.read_paused:
             stuck = self._period_bytes < LEAST_BYTES
         if stuck:

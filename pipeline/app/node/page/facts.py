@@ -20,8 +20,8 @@ from splatpipe.pipeline.app.node.tasks.node import Node
 from splatpipe.pipeline.app.node.tasks.options import LISTED
 from splatpipe.pipeline.app.node.tasks.record import QUEUED, RUNNING, Task
 from splatpipe.pipeline.app.node.tasks.run_options import MARK_FIRST
-from splatpipe.pipeline.app.node.tasks.scheduler import TaskStatus
 from splatpipe.pipeline.app.node.tasks.settings import MAX_FILES
+from splatpipe.pipeline.app.node.tasks.status import TaskStatus
 from splatpipe.pipeline.engine.files.small_file import read_small
 from splatpipe.pipeline.engine.runs.source import FILM_SUFFIXES, MAX_NAMED_BYTES
 from splatpipe.pipeline.photos.files.names import PHOTO_SUFFIXES

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatpipe.pipeline.engine.files.small_file import read_end
+from splatpipe.pipeline.engine.files.text_lines import text_lines
 
 MAX_LOG_BYTES = 8 << 20  # the end of a longer log is kept: a training of a day prints some hundred kilobytes
 WORD = "error"  # a line that is only this is taken for a failure by PyODM
@@ -22,7 +23,7 @@ def log_lines(notes: Sequence[str], output: Path) -> list[str]:
         text = read_end(output, MAX_LOG_BYTES).decode("utf-8", "replace")
     except OSError:
         text = ""
-    return [*notes, *(f"{line}." if line.strip() == WORD else line.rstrip() for line in text.splitlines())]
+    return [*notes, *(f"{line}." if line.strip() == WORD else line.rstrip() for line in text_lines(text))]
 
 
 def last_line(output: Path) -> str:
