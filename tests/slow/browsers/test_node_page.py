@@ -13,7 +13,7 @@ from timeouts import TIMEOUT_S
 from splatpipe.demo import capture_path
 
 PIXELS = 400  # of the longer side: enough to be matched and placed
-PHOTOS = 12
+PHOTOS = 8
 BUDGET = "15s"  # of the run: its training is short
 RUN_MS = 600_000.0  # until a run has ended, on a busy machine
 

@@ -1,5 +1,7 @@
 """A process that checks an uploaded capture, so that the node itself loads no photo: prints JSON, one object a line.
 
+It competes with runs for processors on purpose: somebody waits for it, and it takes a minute where they take hours.
+
     python -m splatpipe.pipeline.app.node.page.check_process PHOTOS PAGE THREADS OPTIONS
 
 PAGE is where to write the preflight's page; OPTIONS are tables over the presets' options, as JSON. Progress is
@@ -9,11 +11,9 @@ PAGE is where to write the preflight's page; OPTIONS are tables over the presets
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.engine.events import Event
 
 MODULE = "splatpipe.pipeline.app.node.page.check_process"
-NICENESS = 10
 PRESETS = ("preview", "standard", "high")
 TELL_S = 0.3  # between two lines of progress
 MOST_FINDINGS = 60
@@ -36,19 +35,11 @@ MOST_CHARACTERS = 600  # of a message or a hint; the page has all of it
 def main() -> None:
     """Check the capture on the command line."""
     photos, page, threads, options = sys.argv[1:]
-    _let_runs_go_first()
     try:
         _tell({"check": _check(Path(photos), Path(page), int(threads), json.loads(options))})
     except SplatpipeError as error:
         text = f"{error.message} {error.hint}".strip()
         _tell({"error": text.replace(f"{photos}/", "").replace(photos, "the upload")})  # no path of this machine
-
-
-def _let_runs_go_first() -> None:
-    """Lower the priority: among all processes, and where Linux shares time among sessions first, of this session."""
-    os.nice(NICENESS)
-    with suppress(OSError):
-        Path("/proc/self/autogroup").write_text(str(NICENESS), encoding="ascii")
 
 
 def _check(photos: Path, page: Path, threads: int, options: dict[str, Any]) -> dict[str, Any]:

@@ -230,7 +230,7 @@ def check(home: Home) -> Callable[..., dict[str, object]]:
     """Keep a result as a check's process would, and return what the page is told."""
 
     def kept(uuid: str, **changes: object) -> dict[str, object]:
-        facts = home.page._facts
+        facts = home.page.facts
         task = home.node.tasks.get(uuid)
         folder = facts.check_folder(uuid)
         folder.mkdir(exist_ok=True)
@@ -251,7 +251,7 @@ def test_a_check_counts_only_for_the_files_that_it_saw(home: Home, check: Callab
 
 def test_checks_wait_for_each_other_and_are_asked_for_once(home: Home) -> None:
     checks, uuid = Checks(1), home.begun("a.jpg")
-    facts = home.page._facts
+    facts = home.page.facts
     upload, folder = facts.upload(home.node.tasks.get(uuid)), facts.check_folder(uuid)
     for _ in range(2):
         checks.ask(uuid, upload, folder)
