@@ -37,6 +37,7 @@ LAYERS = ("mesh", "points")  # of `surfaces.json`
 MAX_SURFACES_BYTES = 64 << 20  # bytes: five times the largest that `publish` writes
 DIGEST_CHARACTERS = 16  # hexadecimal digits, enough to be unique within a site
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
+GROUND = "ground"  # a column of profiles, if the run has a terrain model
 MAX_COORDINATE_M = 1e9  # metres: larger coordinates are not on the earth, and a chart's steps are lost in rounding
 
 
@@ -163,7 +164,8 @@ def _volume(item: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_section_trace(trace: Any) -> bool:
     """Whether the page can draw it: a damaged one must not hide the rest."""
-    if not _has_columns(trace, PROFILE) or not _has_columns(trace, POINTS) or None in trace["distance"]:
+    profile = (*PROFILE, GROUND) if isinstance(trace, dict) and GROUND in trace else PROFILE
+    if not _has_columns(trace, profile) or not _has_columns(trace, POINTS) or None in trace["distance"]:
         return False
     return trace["distance"][-1:] > [0.0] and any(height is not None for height in trace["height"])
 

@@ -17,7 +17,7 @@ SECTION_SIDE = 720
 MAX_SECTIONS = 12  # with a drawing; the list has all
 QUALITY = 85
 MAX_ROWS = 200  # volumes in the table; the file has all of them
-BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated"}
+BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated", "ground": "ground"}
 SIGMA_DIGITS = 2  # significant digits of a standard deviation
 
 Chapter = dict[str, Any]
