@@ -14,8 +14,8 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface.heights.surface_file import SurfaceFile, open_surface
-from splatpipe.pipeline.surface.measuring.volume_file import volume_facts, write_volumes
 from splatpipe.pipeline.surface.measuring.correlation import SHARED_CELLS
+from splatpipe.pipeline.surface.measuring.volume_file import volume_facts, write_volumes
 from splatpipe.pipeline.surface.measuring.volumes import measure_volume
 from splatpipe.pipeline.surface.rasters.grid import Grid, make_grid
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin
