@@ -199,7 +199,8 @@ def _section(item: Mapping[str, Any]) -> dict[str, Any]:
 
 def _volume(item: Mapping[str, Any]) -> dict[str, Any]:
     figures = {key: item[key] for key in VOLUME_FIGURES}
-    return {"name": title_of(item), "base": str(item["base"].get("kind")), **figures, "trace": item["trace"]}
+    of = {"base": str(item["base"].get("kind")), "model": "dtm" if item.get("model") == "dtm" else "dsm"}
+    return {"name": title_of(item), **of, **figures, "trace": item["trace"]}
 
 
 def _is_section_trace(trace: Any) -> bool:

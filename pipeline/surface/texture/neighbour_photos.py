@@ -3,6 +3,9 @@
 A photo's depths have holes, and each triangle knows only its best photos. So small parts remain whose neighbours show a
 photo that sees them nearly as well. Here such a photo is asked: it is taken if it sees a triangle, or has no depth
 there but much the same colour, and does not cost much more. Each border that goes saves seams, room and files' size.
+
+A triangle that no photo is known to see takes a neighbour's photo unless that photo's depths say that something else is
+there: the surface goes on a little where depths end.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from splatpipe.pipeline.surface.texture.face_choice import Labels, same_label
 from splatpipe.pipeline.surface.texture.face_graph import connected_parts
 from splatpipe.pipeline.surface.texture.face_views import HIDDEN, NONE, FaceSamples, FaceViews, rate_rows
 
-ROUNDS = 3  # in which parts that were joined, or were refused by one neighbour, ask again
+ROUNDS = 3  # in which triangles ask again, and so how many in a row go on from where depths end
 MORE_COST = 600.0  # that a neighbour's photo may cost more: some pixels half as wide again, or 35 degrees more oblique
 ALIKE = 20.0  # difference of colours, grey levels, up to which a photo without a depth there is believed
 
@@ -68,7 +71,7 @@ class NeighbourPhotos:
         self._place[faces.order] = np.arange(len(faces.order))
 
     def join(self, label: Labels, graph: FaceNeighbours) -> None:
-        """Give triangles of small parts the labels of their neighbours; changes the labels in place."""
+        """Give triangles of small parts, and without a photo, labels of their neighbours; changes them in place."""
         refused = np.zeros(0, np.int64)
         for _ in range(ROUNDS):
             offers = _offers(label, graph, refused)
@@ -90,9 +93,10 @@ class NeighbourPhotos:
         return taken
 
     def _answer(self, offers: _Offers, label: Labels, question: tuple[int, Rows]) -> Bool[np.ndarray, " k"]:
-        """Whether a photo sees triangles nearly as well as their own photo does."""
+        """Whether a photo sees triangles nearly as well as their own photo does, if they have one."""
         number, which = question
         rows = offers.rows[which]
+        bare = label[rows] == NONE
         own = self._views.photo[rows] == label[rows][:, None]
         at = own.argmax(axis=1)[:, None]
         cost = np.take_along_axis(self._views.cost[rows], at, axis=1)[:, 0]
@@ -104,11 +108,11 @@ class NeighbourPhotos:
         back[order] = np.arange(len(order))
         theirs, seen = rating.cost[back].astype(np.float64), rating.seen[back]
         cheap = (theirs < HIDDEN) & (theirs <= cost + MORE_COST)
-        alike = cheap & ~seen
+        alike = cheap & ~seen & ~bare
         alike[alike] = (
             np.abs(self._colours(number, place[alike]) - colour[alike].astype(np.float64)).mean(axis=1) <= ALIKE
         )
-        return np.asarray(cheap & (seen | alike))
+        return np.asarray(cheap & (seen | alike | bare))
 
     def _colours(self, number: int, place: Rows) -> Float64[np.ndarray, "k 3"]:
         """Levelled mean colours of triangles in a photo."""
@@ -133,10 +137,14 @@ class NeighbourPhotos:
 
 
 def _offers(label: Labels, graph: FaceNeighbours, refused: Int64[np.ndarray, " k"]) -> _Offers:
-    """For each triangle of a small part the photo that most of the part's larger neighbours have."""
-    count, part = connected_parts(graph.beyond, same_label(label, graph.beyond))
-    size = np.bincount(part, graph.areas, count)
-    small = (size < graph.least_m2)[part] & (label != NONE)
+    """For each triangle of a small part the photo that most of the part's larger neighbours have.
+
+    A triangle without a photo is a part of its own, smaller than all others.
+    """
+    bare = label == NONE
+    count, part = connected_parts(graph.beyond, same_label(label, graph.beyond) & ~bare[:, None])
+    size = np.bincount(part, np.where(bare, 0.0, graph.areas), count)
+    small = (size < graph.least_m2)[part]
     face, edge = np.nonzero((graph.beyond >= 0) & small[:, None])
     near = graph.beyond[face, edge]
     outer = (part[near] != part[face]) & (label[near] != NONE) & (size[part[near]] > size[part[face]])

@@ -261,6 +261,26 @@ def test_a_lonely_triangle_takes_its_neighbours_photo_if_that_shows_it(hole: boo
     assert (common in views.photo[lonely]) == joined  # seams may mix it
 
 
+def test_triangles_without_a_photo_go_on_from_those_beside_unless_something_else_is_there() -> None:
+    mesh, views, label, lonely = lonely_triangle()
+    label[:] = label[0]
+    hidden = together(mesh, TriangleMesh(mesh.vertices - np.array([0.0, 0.0, 3.0]), mesh.triangles))  # below the lawn
+    beyond = adjacent_faces(hidden.triangles)
+    beyond[lonely, 0], beyond[lonely + 72, 0] = lonely + 72, lonely
+    every = np.concatenate([label, np.full(72, NONE, np.int16)])
+    every[lonely] = NONE
+    both = FaceViews(
+        *(
+            np.concatenate([each, np.full_like(each, NONE if k == 0 else 0)])
+            for k, each in enumerate(vars(views).values())
+        )
+    )
+    both.photo[lonely] = NONE
+    asked = NeighbourPhotos(exact_photos(), sample_faces(hidden), both, GSD_M, 1)
+    asked.join(every, FaceNeighbours(beyond, hidden.areas(), 1.0))
+    assert (every[:72] == label[0]).all() and (every[72:] == NONE).all()
+
+
 def test_small_charts_near_each_other_share_a_rectangle_if_that_needs_less_room() -> None:
     lawn = flat_mesh(-4.9, 12, 0.2)
     mesh = TriangleMesh(lawn.vertices - [0.0, 4.9, 0.0], lawn.triangles)

@@ -29,7 +29,8 @@ function sectionLines({ length_m, share_with_height, height_sigma_m }) {
 function volumeLines(facts) {
   const volume = (kind) => `${withSigma(facts[`${kind}_m3`], facts[`${kind}_sigma_m3`])} m³`;
   const base = { rim: "the plane through the rim", lowest: "the lowest point of the rim", stated: "a stated height", ground: "the ground" }[facts.base];
-  return [`net ${volume("net")}`, `cut ${volume("cut")}, fill ${volume("fill")}`, `${facts.area_m2.toFixed(1)} m², over ${base ?? "a base"}`];
+  const over = `${facts.area_m2.toFixed(1)} m²${facts.model === "dtm" ? " of ground" : ""}, over ${base ?? "a base"}`;
+  return [`net ${volume("net")}`, `cut ${volume("cut")}, fill ${volume("fill")}`, over];
 }
 
 /** The part of the window not covered by the list and the photos, CSS pixels. */
