@@ -3,7 +3,8 @@
 The stage `export` writes the page before there is a surface model, and sections can be cut on a finished run at any
 time. So these are put into the copy of the page in OUT; the artifact itself is unchanged. The page keeps its mtime, so
 that the store still recognises it as that copy (``is_copy``), and the same state gives the same bytes. A site gets the
-mesh and the points as a file beside the page, which loads it when they are first shown.
+mesh and the points as a file beside the page, which loads it when they are first shown. Every command ends here, and
+pages are large: `stages/viewers.json` says what they show, and they are read only if there is something else.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.files.output_file import is_inside
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
+from splatpipe.pipeline.engine.runs.store import Part
 from splatpipe.pipeline.web import script_safe
 from splatpipe.pipeline.web.measured_page import (
     PAGE,
@@ -35,8 +37,10 @@ VOLUME_FIGURES = ("cut_m3", "cut_sigma_m3", "fill_m3", "fill_sigma_m3", "net_m3"
 PLACES = ("x", "y", "z")
 LAYERS = ("mesh", "points")  # of `surfaces.json`
 MAX_SURFACES_BYTES = 64 << 20  # bytes: five times the largest that `publish` writes
+SHOWN = Path("stages/viewers.json")
 DIGEST_CHARACTERS = 16  # hexadecimal digits, enough to be unique within a site
 PROFILE, POINTS = ("distance", "height", "sigma", *PLACES), ("point_distance", "point_height")
+GROUND = "ground"  # a column of profiles, if the run has a terrain model
 MAX_COORDINATE_M = 1e9  # metres: larger coordinates are not on the earth, and a chart's steps are lost in rounding
 
 
@@ -58,8 +62,11 @@ def update_viewer(out: Path) -> str:
     pages = [name for name in own if (out / name).is_file()]
     if not pages:
         return ""
-    surfaces = displayed_surfaces(out)
     measurements, trouble = displayed_measurements(out) if has_measurements(out) else None, ""
+    part = _surfaces_part(out)
+    if _shown(out) == _to_show(out, pages, measurements, part):
+        return ""
+    surfaces = _read_surfaces(part)
     for name in pages:
         try:
             beside = None if name == PAGE else (out / name).with_name(SURFACES)
@@ -70,14 +77,43 @@ def update_viewer(out: Path) -> str:
                     f"{name} was written by an earlier version and cannot show all results; update it with: "
                     f"splatpipe stage export {out}"
                 )
+    if not trouble:
+        write_durably(out / SHOWN, json.dumps(_to_show(out, pages, measurements, part), sort_keys=True))
     return trouble
+
+
+def _to_show(
+    out: Path, pages: Sequence[str], measurements: Mapping[str, Any] | None, surfaces: Part | None
+) -> dict[str, Any]:
+    """The pages' files as they are, and digests of what they are to show."""
+    beside = out / Path(SITE_PAGE).with_name(SURFACES)
+    files = [out / name for name in pages] + ([beside] if beside.is_file() else [])
+    return {
+        "files": {path.relative_to(out).as_posix(): _identity(path) for path in files},
+        "measurements": hashlib.sha256(_json(measurements or {})).hexdigest(),
+        "surfaces": "" if surfaces is None else surfaces.digest,
+    }
+
+
+def _identity(path: Path) -> list[int]:
+    """What changes if anybody writes a file."""
+    facts = path.stat()
+    return [facts.st_size, facts.st_ino, facts.st_mtime_ns, facts.st_ctime_ns]
+
+
+def _shown(out: Path) -> Any:
+    """What the last command left in the pages; None if it is not known."""
+    try:
+        return read_json(out / SHOWN)
+    except (OSError, ValueError):
+        return None
 
 
 def _surfaces_of_page(surfaces: Mapping[str, Any] | None, beside: Path | None) -> bytes | None:
     """What a page needs to show the mesh and the points; None if there are none.
 
     Args:
-        surfaces: From ``displayed_surfaces``.
+        surfaces: From ``_read_surfaces``.
         beside: A file for it beside the page; None to put it into the page.
     """
     if surfaces is None:
@@ -97,14 +133,19 @@ def _json(value: Mapping[str, Any]) -> bytes:
     return script_safe(json.dumps(value, separators=(",", ":"), allow_nan=False)).encode("ascii")
 
 
-def displayed_surfaces(out: Path) -> dict[str, Any] | None:
-    """The mesh and the points to show, those of the page's run and frame. None if there are none."""
+def _surfaces_part(out: Path) -> Part | None:
+    """The part with the mesh and the points, if it is of the page's run and frame."""
     from splatpipe.stages.line import EXPORT, LINE, PUBLISH
 
     run = open_run_folder(out, LINE)
     published, of_page = run.lineage(PUBLISH), run.lineage(EXPORT)
     part, frames = published.get("publish.viewer"), [parts.get("georef.frame") for parts in (published, of_page)]
-    if part is None or None in frames or len({frame.digest for frame in frames if frame is not None}) != 1:
+    return part if None not in frames and len({frame.digest for frame in frames if frame is not None}) == 1 else None
+
+
+def _read_surfaces(part: Part | None) -> dict[str, Any] | None:
+    """The mesh and the points to show; None if there are none."""
+    if part is None:
         return None
     try:
         found = read_json(part.path / SURFACES, MAX_SURFACES_BYTES)
@@ -158,12 +199,14 @@ def _section(item: Mapping[str, Any]) -> dict[str, Any]:
 
 def _volume(item: Mapping[str, Any]) -> dict[str, Any]:
     figures = {key: item[key] for key in VOLUME_FIGURES}
-    return {"name": title_of(item), "base": str(item["base"].get("kind")), **figures, "trace": item["trace"]}
+    of = {"base": str(item["base"].get("kind")), "model": "dtm" if item.get("model") == "dtm" else "dsm"}
+    return {"name": title_of(item), **of, **figures, "trace": item["trace"]}
 
 
 def _is_section_trace(trace: Any) -> bool:
     """Whether the page can draw it: a damaged one must not hide the rest."""
-    if not _has_columns(trace, PROFILE) or not _has_columns(trace, POINTS) or None in trace["distance"]:
+    profile = (*PROFILE, GROUND) if isinstance(trace, dict) and GROUND in trace else PROFILE
+    if not _has_columns(trace, profile) or not _has_columns(trace, POINTS) or None in trace["distance"]:
         return False
     return trace["distance"][-1:] > [0.0] and any(height is not None for height in trace["height"])
 

@@ -1,4 +1,4 @@
-"""Measures sections and volumes on a finished run's DSM, into OUT/sections, OUT/volumes.json and the pages."""
+"""Measures sections and volumes on a finished run's DSM and DTM, into OUT/sections, OUT/volumes.json and the pages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from splatpipe.pipeline.engine.files.durable import sync_folder
 from splatpipe.pipeline.engine.files.output_file import own_folder
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.runs.store import Part
-from splatpipe.stages.line import DEPTHS, DSM, GEOREF, LINE, UNDISTORT
+from splatpipe.stages.line import DEPTHS, DSM, DTM, GEOREF, LINE, UNDISTORT
 from splatpipe.stages.options import LineConfig
 from splatpipe.stages.products import NO_PRODUCTS
 
@@ -32,7 +32,8 @@ MAX_SECTION_POINTS = 2000  # most points in a section's trace: more than a chart
 MAX_TRACE_POINTS = 60_000  # most points in all traces together: they add at most 3 MB to a page
 MAX_RING_POINTS = 400  # most points in a polygon's ring
 MAX_TRACED_VOLUMES = 200  # most volumes in pages; any more are only in volumes.json
-Base = Literal["rim", "lowest"] | float
+Base = Literal["rim", "lowest", "ground"] | float
+Model = Literal["dsm", "dtm"]
 Line = tuple[float, float, float, float]
 
 
@@ -43,34 +44,48 @@ class MeasurementRequest:
     Attributes:
         lines: Lines of the sections, in the run's CRS.
         polygons: A GeoJSON file with the polygons of volumes; None for none.
-        base: Base of the volumes: ``rim``, ``lowest``, or a height in the CRS's unit.
+        base: Base of the volumes: ``rim``, ``lowest``, ``ground``, or a height in the CRS's unit.
+        model: Heights of the volumes: the topmost surface, or the ground.
     """
 
     lines: tuple[Line, ...]
     polygons: Path | None
     base: Base
+    model: Model = "dsm"
 
     @property
     def anything(self) -> bool:
         """Whether there is anything to measure."""
         return bool(self.lines) or self.polygons is not None
 
+    @property
+    def products(self) -> str:
+        """The products that it needs."""
+        return "dtm" if self.polygons is not None and (self.model == "dtm" or self.base == "ground") else "dsm"
+
     @staticmethod
-    def of(sections: Sequence[str], polygons: Path | None, base: str) -> MeasurementRequest:
+    def of(sections: Sequence[str], polygons: Path | None, base: str, model: str = "dsm") -> MeasurementRequest:
         """Parse the request from command-line options.
 
         Raises:
-            UsageError: if a section is not a line or has no length, the base is invalid, or there is no such file.
+            UsageError: if a section is not a line or has no length, the base or the model is invalid, or there is no
+                such file.
         """
         if len(sections) > MAX_SECTIONS:
             raise UsageError(f"{len(sections)} sections are too many.", hint=f"At most {MAX_SECTIONS} at a time.")
         height = _number(base)
-        if height is None and base not in ("rim", "lowest"):
-            raise UsageError(f'There is no base "{base[:40]}".', hint="Choose rim, lowest, or a height.")
+        if height is None and base not in ("rim", "lowest", "ground"):
+            raise UsageError(f'There is no base "{base[:40]}".', hint="Choose rim, lowest, ground, or a height.")
+        if model not in ("dsm", "dtm"):
+            raise UsageError(f'There is no model "{model[:40]}".', hint="Choose dsm or dtm.")
+        if model == "dtm" and base == "ground":
+            raise UsageError("Between the ground and itself there is no volume.", hint="Choose another base or model.")
         if polygons is not None and not polygons.is_file():  # reported now: the products may take minutes
             raise UsageError(f"There is no file {polygons}.", hint="Give --volume a GeoJSON file of polygons.")
-        plane: Base = height if height is not None else "rim" if base == "rim" else "lowest"
-        return MeasurementRequest(tuple(_line(text) for text in sections), polygons, plane)
+        named: dict[str, Base] = {"rim": "rim", "lowest": "lowest", "ground": "ground"}
+        measured_from = height if height is not None else named[base]
+        lines = tuple(_line(text) for text in sections)
+        return MeasurementRequest(lines, polygons, measured_from, "dtm" if model == "dtm" else "dsm")
 
 
 def _line(text: str) -> Line:
@@ -100,12 +115,26 @@ class _SurfaceModel:
         frame: The frame of `georef`.
         crs: The model's CRS.
         model: Its heights.
+        terrain: The terrain model made from it; None if there is none.
     """
 
     parts: Mapping[str, Part]
     frame: Frame
     crs: MapCrs
     model: SurfaceFile
+    terrain: SurfaceFile | None
+
+    def ground(self) -> SurfaceFile:
+        """The terrain model.
+
+        Raises:
+            SplatpipeError: if there is none.
+        """
+        if self.terrain is None:
+            raise SplatpipeError(
+                "The run has no terrain model.", hint="Make one first: splatpipe surface OUT --products dtm."
+            )
+        return self.terrain
 
     @property
     def digests(self) -> tuple[str, str]:
@@ -210,12 +239,20 @@ def _open_surface(out: Path) -> _SurfaceModel:
     from splatpipe.pipeline.surface.rasters.map_crs import open_map
     from splatpipe.pipeline.survey.crs.frames import load_frame
 
-    parts = open_run_folder(out, LINE).lineage(DSM, DEPTHS, UNDISTORT, GEOREF)
+    run = open_run_folder(out, LINE)
+    parts = run.lineage(DSM, DEPTHS, UNDISTORT, GEOREF)
     files = parts["dsm.files"].path if "dsm.files" in parts else None
     if files is None or not (files / "dsm.tif").is_file():
         raise SplatpipeError("The run has no surface model.", hint=f"Make one first: splatpipe surface {out}")
     frame = load_frame(parts["georef.frame"].path)
-    return _SurfaceModel(parts, frame, open_map(frame), open_surface(files / "dsm.tif", files / "dsm_confidence.tif"))
+    model = open_surface(files / "dsm.tif", files / "dsm_confidence.tif")
+    terrain = None
+    below = run.lineage(DTM)
+    ground = below["dtm.files"].path if "dtm.files" in below else None
+    of_model = "dsm.files" in below and below["dsm.files"].digest == parts["dsm.files"].digest
+    if ground is not None and of_model and (ground / "dtm.tif").is_file():
+        terrain = open_surface(ground / "dtm.tif", ground / "dtm_confidence.tif")
+    return _SurfaceModel(parts, frame, open_map(frame), model, terrain)
 
 
 def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threads: int) -> Items:
@@ -234,7 +271,7 @@ def _sections(surface: _SurfaceModel, lines: Sequence[Line], folder: Path, threa
     most = min(MAX_SECTION_POINTS, MAX_TRACE_POINTS // len(lines))
     found = []
     for number, line in enumerate(lines, 1):
-        section = cut_section(surface.model, line, surface.crs, sources, threads)
+        section = cut_section(surface.model, line, surface.crs, sources, threads, surface.terrain)
         facts = write_section(folder, f"section-{number}", section, surface.crs)
         found.append({**facts, "trace": section_trace(section, surface.crs, most)})
     return found
@@ -267,13 +304,15 @@ def _volumes(surface: _SurfaceModel, wanted: MeasurementRequest) -> Items:
     most = max(4, min(MAX_RING_POINTS, MAX_TRACE_POINTS // rings))
     uncertainty = surface.frame.residuals.get("uncertainty") or {}  # absent if control points georeference the run
     datum_sigma_m = float(uncertainty.get("offset_sigma_m", (0.0,))[-1])
+    model = surface.ground() if wanted.model == "dtm" else surface.model
+    base = surface.ground() if wanted.base == "ground" else wanted.base
     found: Items = []
     for number, (polygon, name) in enumerate(zip(area.polygons, drawing.names, strict=True), 1):
         alone = PlanArea(area.axes, (polygon,))
-        volume = measure_volume(surface.model, alone, surface.crs, wanted.base, datum_sigma_m)
-        facts = volume_facts(number, name, volume)
+        volume = measure_volume(model, alone, surface.crs, base, datum_sigma_m)
+        facts = {**volume_facts(number, name, volume), "model": wanted.model}
         if number <= MAX_TRACED_VOLUMES:
-            facts["trace"] = polygon_trace(surface.model, polygon, surface.crs, most)
+            facts["trace"] = polygon_trace(model, polygon, surface.crs, most)
         found.append(facts)
     return found
 

@@ -196,7 +196,7 @@ def surface(
         typer.Option(
             metavar="NAMES",
             help="Products to make: ortho, dsm, dtm, facades, cloud, mesh; existing ones are kept. Default: "
-            "ortho,dsm,dtm; for a section or a volume, dsm.",
+            "ortho,dsm,dtm; for a section or a volume, dsm, or dtm if the ground is needed.",
         ),
     ] = None,
     gsd: Annotated[
@@ -221,10 +221,17 @@ def surface(
     base: Annotated[
         str,
         typer.Option(
-            metavar="rim|lowest|HEIGHT",
-            help="Base of volumes: a plane through the rim, or a level at the rim's lowest point or at HEIGHT.",
+            metavar="rim|lowest|ground|HEIGHT",
+            help="Base of volumes: a plane through the rim, a level at the rim's lowest point or at HEIGHT, or the "
+            "ground (DTM), filled in under what stands on it.",
         ),
     ] = "rim",
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="dsm|dtm", help="Heights of volumes: the topmost surface, or the ground without trees and machines."
+        ),
+    ] = "dsm",
     assignments: SetOption = None,
     *,
     machine: MachineOptions,
@@ -237,8 +244,8 @@ def surface(
 
     with CommandSummary(out, session.as_json) as done:
         done.notify_by(session.notify)
-        wanted = MeasurementRequest.of(section or [], volume, base)
-        products = "dsm" if products is None and wanted.anything else products
+        wanted = MeasurementRequest.of(section or [], volume, base, model)
+        products = wanted.products if products is None and wanted.anything else products
         products_table = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
         tables = [products_table, *overrides(None, assignments, None).tables]
         request = existing_request(out, tables, machine.device, machine.threads)

@@ -16,12 +16,13 @@ BAR_PARTS = 4
 TEXT_MM, TITLE_MM = 2.5, 5.0  # ISO 3098's heights of letters
 GAP_MM = 6.0  # between what is drawn and what is written about it
 
-EXTENT, OUTLINE, OPENINGS, PROJECTIONS, SURFACE, POINTS, GRID, TEXTS, PICTURE = (
+EXTENT, OUTLINE, OPENINGS, PROJECTIONS, SURFACE, GROUND, POINTS, GRID, TEXTS, PICTURE = (
     "EXTENT",
     "OUTLINE",
     "OPENINGS",
     "PROJECTIONS",
     "SURFACE",
+    "GROUND",
     "POINTS",
     "GRID",
     "TEXT",

@@ -22,6 +22,7 @@ from splatpipe.pipeline.engine.files.durable import whole_file, write_durably
 from splatpipe.pipeline.surface.drawings.drawing import (
     EXTENT,
     GRID,
+    GROUND,
     OPENINGS,
     OUTLINE,
     PICTURE,
@@ -53,6 +54,7 @@ LAYERS = {
     PROJECTIONS: (30, 25, "#c06000"),
     POINTS: (5, 0, "#3060d0"),
     SURFACE: (7, 35, "#000000"),
+    GROUND: (32, 25, "#a0602a"),
     TEXTS: (7, 18, "#000000"),
 }
 ANCHORS: Mapping[str, Literal["LEFT", "CENTER", "RIGHT"]] = {"start": "LEFT", "middle": "CENTER", "end": "RIGHT"}

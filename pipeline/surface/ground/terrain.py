@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.ndimage import distance_transform_edt
 
 from splatpipe.pipeline.surface.ground.blocks import LOW_SHARE, BlockGrid, inner, mean_heights, quantiles, unblocked
 from splatpipe.pipeline.surface.ground.ground_filter import WIDEST_M, GroundScale, find_ground
@@ -190,7 +191,7 @@ def _distance(known: Mask) -> Cells:
     """Distance of each block to the next that is known, blocks."""
     if not known.any():
         return np.full(known.shape, float(max(known.shape)))
-    return np.asarray(cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float64)
+    return np.asarray(distance_transform_edt(~known), np.float64)  # exact: OpenCV's last bits differ from call to call
 
 
 def _surrounded(top: Cells, block_m: float) -> Mask:

@@ -21,6 +21,7 @@ LENGTH_WEIGHT = 1e-3  # of an edge's squared length: on level ground, short edge
 MIN_TURN = 0.3  # least cosine between a triangle's normals before and after
 CHEAPEST = 0.6  # share of the vertices that are candidates in a pass
 MAX_PASSES = 60
+BATCH = 1 << 16  # edges at a time: their planes take 0.4 KB each
 MIN_GAIN = 0.005  # a pass that removes less of the triangles is the last
 
 
@@ -125,9 +126,13 @@ class _Quadrics:
         return float(missed.max())
 
     def _missed(self, edges: _Edges) -> Float64[np.ndarray, " e"]:
-        place = np.concatenate([self._places[edges.kept], np.ones((len(edges.kept), 1))], axis=1)
-        sums = self._sums[edges.gone] + self._sums[edges.kept]
-        return np.asarray(np.einsum("ei,eij,ej->e", place, sums, place))
+        missed = np.empty(len(edges.gone))
+        for start in range(0, len(missed), BATCH):
+            part = np.s_[start : start + BATCH]
+            gone, kept = edges.gone[part], edges.kept[part]
+            place = np.concatenate([self._places[kept], np.ones((len(kept), 1))], axis=1)
+            missed[part] = np.einsum("ei,eij,ej->e", place, self._sums[gone] + self._sums[kept], place)
+        return missed
 
 
 def _keys(edges: _Edges, size: int) -> Int64[np.ndarray, " e"]:

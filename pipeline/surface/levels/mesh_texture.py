@@ -43,9 +43,9 @@ class TexturePages:
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if picture is None:
             raise SplatpipeError(f"{path.name} cannot be read.", "Make it again with --rerun mesh.")
-        kept = open_memmap(self._folder / f"{number}.npy", "w+", picture.dtype, picture.shape)
-        kept[:] = picture
-        return kept
+        path = self._folder / f"{number}.npy"
+        np.save(path, picture)
+        return np.asarray(open_memmap(path, "r"))  # what was written is not mapped: it would count as memory
 
     def __getitem__(self, page: int) -> UInt8[np.ndarray, "h w 3"]:
         """A page: blue, green, red."""

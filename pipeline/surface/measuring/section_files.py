@@ -15,6 +15,7 @@ from splatpipe.pipeline.engine.files.durable import whole_file
 from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.surface.drawings.drawing import (
     GRID,
+    GROUND,
     POINTS,
     SURFACE,
     Dots,
@@ -87,21 +88,30 @@ def section_drawing(name: str, section: Section, crs: MapCrs) -> Drawing:
         section: The section.
         crs: CRS of its coordinates.
     """
-    up = section.height * crs.height_unit_m
-    heights = np.concatenate([up[np.isfinite(up)], section.points[:, 1]])
+    lines_up = {SURFACE: section.height * crs.height_unit_m}
+    if section.ground is not None:
+        lines_up[GROUND] = section.ground * crs.height_unit_m
+    every = np.concatenate([*lines_up.values(), section.points[:, 1]])
+    heights = every[np.isfinite(every)]
     low, high = float(heights.min()), float(heights.max())
     scale = plot_scale(section.length_m, high - low)
     step = next((metres for metres in GRID_STEPS_M if metres * 1000.0 / scale >= GRID_MM), GRID_STEPS_M[-1])
     bottom, top = math.floor(low / step) * step, math.ceil(high / step) * step
     top = max(top, bottom + step)
     lines, numbers = _grid(section.length_m, (bottom, top), step, scale)
-    profile = [Stroke(SURFACE, line) for line in _unbroken(np.stack([section.distance_m, up], axis=1))]
+    profile = [
+        Stroke(layer, line)
+        for layer, up in reversed(lines_up.items())  # the surface over the ground
+        for line in _unbroken(np.stack([section.distance_m, up], axis=1))
+    ]
     bar, lengths = scale_bar(section.length_m, bottom - 3.0 * LABEL_MM * scale / 1000.0, scale)
     x1, y1, x2, y2 = section.line
-    about = (
+    about = [
         f"1:{scale} on A3, {section.length_m:.2f} m from {x1:.3f}, {y1:.3f} to {x2:.3f}, {y2:.3f}",
         f"Heights: {crs.described_heights().rpartition(',')[0]}, metres. {crs.horizontal.name}",
-    )
+    ]
+    if section.ground is not None:
+        about.append("Black: topmost surface. Brown: ground. Blue: what photos see near the plane.")
     title = caption(name.replace("-", " ").capitalize(), about, 0.0, bottom - 3.0 * LABEL_MM * scale / 1000.0, scale)
     dots = Dots(POINTS, section.points) if len(section.points) else None
     return Drawing(scale, [*lines, *bar, *profile], [*numbers, *lengths, *title], dots=dots)
@@ -131,6 +141,9 @@ def _write_heights(path: Path, section: Section, crs: MapCrs) -> None:
     plan, height = unit_key(crs.unit_m), unit_key(crs.height_unit_m)
     header = ["distance_m", f"easting_{plan}", f"northing_{plan}", f"height_{height}", "height_sigma_m"]
     columns = [section.distance_m, *section.place.T, section.height, section.sigma_m]
+    if section.ground is not None:
+        header += [f"ground_{height}", f"over_ground_{height}"]
+        columns += [section.ground, np.maximum(section.height - section.ground, 0.0)]
     _write_table(path, header, np.stack(columns, axis=1))
 
 

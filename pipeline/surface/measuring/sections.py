@@ -1,7 +1,7 @@
 """Sections: vertical cuts through the ground and everything on it along a line.
 
 The surface model gives the topmost height at each place. If depth maps are available, their points near the plane are
-added: a surface model cannot represent walls and overhangs.
+added: a surface model cannot represent walls and overhangs. If there is a terrain model, so is the ground below.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class Section:
         place: Eastings and northings.
         height: Heights of the surface, in the CRS's unit; NaN where there is none.
         sigma_m: Expected deviation of each height, metres; NaN where unknown.
+        ground: Heights of the terrain model, in the CRS's unit; NaN where there is none; None without such a model.
         points: Distances from the start and heights, both in metres, of points that photos see near the plane.
     """
 
@@ -47,6 +48,7 @@ class Section:
     place: Float64[np.ndarray, "n 2"]
     height: Float64[np.ndarray, " n"]
     sigma_m: Float64[np.ndarray, " n"]
+    ground: Float64[np.ndarray, " n"] | None
     points: Float64[np.ndarray, "k 2"]
 
     @property
@@ -55,8 +57,15 @@ class Section:
         return float(self.distance_m[-1])
 
 
-def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence[DepthSource], threads: int) -> Section:
-    """Cut a section through a surface model, and through depth maps if there are any.
+def cut_section(
+    surface: SurfaceFile,
+    line: Line,
+    crs: MapCrs,
+    sources: Sequence[DepthSource],
+    threads: int,
+    terrain: SurfaceFile | None = None,
+) -> Section:
+    """Cut a section through a surface model, and through depth maps and a terrain model if there are any.
 
     Args:
         surface: The surface model.
@@ -64,6 +73,7 @@ def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence
         crs: CRS of the surface model.
         sources: Depths of the photos, local metres; empty for the surface alone.
         threads: Photos in parallel.
+        terrain: The terrain model on the surface model's grid; None for none.
 
     Raises:
         SplatpipeError: if the line has no length, is absurdly long, or does not cross the surface.
@@ -89,7 +99,8 @@ def cut_section(surface: SurfaceFile, line: Line, crs: MapCrs, sources: Sequence
         ends = crs.local_from_crs(np.array([[*start, middle], [*end, middle]]))
         points = _points(sources, ends, surface.cell * metre, threads)
         points = _raised(points, ends, crs)
-    return Section(line, share * length * metre, place, height, sigma_m, points)
+    ground = None if terrain is None else terrain.along(place)[0]
+    return Section(line, share * length * metre, place, height, sigma_m, ground, points)
 
 
 def _points(

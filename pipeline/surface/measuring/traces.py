@@ -24,14 +24,15 @@ def section_trace(section: Section, crs: MapCrs, most: int) -> dict[str, Column]
 
     Returns:
         Columns, all in metres: ``distance``, ``height`` and ``sigma`` (heights as the CRS counts them, None where the
-        surface has a hole), ``x``, ``y``, ``z`` of the same places in the world frame; and ``point_distance``,
-        ``point_height`` of what photos see near the plane.
+        surface has a hole), ``x``, ``y``, ``z`` of the same places in the world frame; ``point_distance``,
+        ``point_height`` of what photos see near the plane; and ``ground`` as ``height``, if there is a terrain model.
     """
     rows = _rows_to_keep(section.height, most)
     height = section.height[rows]
     known = np.isfinite(height)
     local = np.full((len(rows), 3), np.nan)
     local[known] = crs.local_from_crs(np.column_stack([section.place[rows][known], height[known]]))
+    ground = {} if section.ground is None else {"ground": _column(section.ground[rows] * crs.height_unit_m)}
     points = section.points[:: max(1, -(-len(section.points) // most))]
     return {
         "distance": _column(section.distance_m[rows]),
@@ -40,6 +41,7 @@ def section_trace(section: Section, crs: MapCrs, most: int) -> dict[str, Column]
         **dict(zip("xyz", map(_column, local.T), strict=True)),
         "point_distance": _column(points[:, 0]),
         "point_height": _column(points[:, 1]),
+        **ground,
     }
 
 

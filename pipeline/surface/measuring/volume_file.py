@@ -15,8 +15,9 @@ FORMAT = 1
 DIGITS = 4
 HOW = (
     "One standard deviation: the cells' expected deviations, shared by some 13 neighbours each; the base's, by the "
-    "misfit of the rim to it; for a stated height that of photo positions, where these place the run. Volumes are of "
-    "the part that has heights, and nothing is filled in. Lengths are on the ground. Noise about the base makes cut "
+    "misfit of the rim to it; for a stated height that of photo positions, where these place the run; for the ground, "
+    "that of filled ground, as if all of it in a polygon were off alike. Volumes are of the part that has heights, and "
+    "nothing is filled in but the ground. Lengths are on the ground. Noise about the base makes cut "
     "and fill larger alike, and not the net."
 )
 
@@ -44,7 +45,6 @@ def volume_facts(number: int, name: str, volume: Volume) -> dict[str, Any]:
         name: Name of the polygon; empty for none.
         volume: The volume in it.
     """
-    base = volume.base
     kinds = {"cut": volume.cut, "fill": volume.fill, "net": volume.net}
     return {
         "polygon": number,
@@ -53,15 +53,7 @@ def volume_facts(number: int, name: str, volume: Volume) -> dict[str, Any]:
         "area_m2": round(volume.area_m2, DIGITS),
         "area_without_height_m2": round(volume.area_m2 - volume.known_m2, DIGITS),
         "share_without_height": round(1.0 - volume.known_m2 / volume.area_m2, DIGITS),
-        "base": {
-            "kind": base.kind,
-            "place": [round(float(value), DIGITS) for value in base.middle],
-            "height_m": round(float(base.terms[0]), DIGITS),
-            "height_sigma_m": round(float(base.covariance[0, 0]) ** 0.5, DIGITS),
-            "rise_to_east_percent": round(100.0 * float(base.terms[1]), DIGITS),
-            "rise_to_north_percent": round(100.0 * float(base.terms[2]), DIGITS),
-            "rim_misfit_m": None if base.misfit_m is None else round(base.misfit_m, DIGITS),
-        },
+        "base": volume.base.facts(),
     }
 
 

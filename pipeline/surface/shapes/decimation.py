@@ -33,7 +33,7 @@ def simplifier() -> Any:
 def decimate(mesh: TriangleMesh, most: int) -> TriangleMesh:
     """Decimate a mesh to a maximum number of triangles (quadric error metrics; Garland and Heckbert 1997).
 
-    Planes keep few triangles and edges their place; one thread, and the same bits each time.
+    Planes keep few triangles, and edges and open borders their place; one thread, and the same bits each time.
 
     Args:
         mesh: Mesh in canonical order.
@@ -46,7 +46,8 @@ def decimate(mesh: TriangleMesh, most: int) -> TriangleMesh:
         return mesh
     low = mesh.vertices.min(axis=0)  # float32 is finer near zero
     vertices, triangles = (mesh.vertices - low).astype(np.float32), mesh.triangles.astype(np.int32)
-    found, corners = simplifier().simplify(vertices, triangles, target_count=most, agg=AGGRESSIVENESS)
+    reduce = simplifier().simplify
+    found, corners = reduce(vertices, triangles, target_count=most, agg=AGGRESSIVENESS, preserve_border=True)
     whole = TriangleMesh(found.astype(np.float64) + low, corners.astype(np.int64))
     return whole.select(whole.areas() > 0.0)
 

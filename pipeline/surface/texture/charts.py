@@ -1,6 +1,8 @@
-"""Charts: connected triangles that show one photo, flattened by projection into it, and small cells for the unseen.
+"""Charts: triangles that show one photo, flattened by projection into it, and small cells for the unseen.
 
 In its own photo no visible triangle hides another, so charts need no unfolding: their texture is the photo itself.
+Triangles of a chart are connected; or there are a few groups of them near each other in the photo, which together need
+less room than with a border each.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ BORDER = 2  # texels around a chart's triangles: filters read beyond them
 MAX_SIDE = 1024  # photo pixels: larger charts are cut
 MIN_FILL, MIN_AREA = 0.45, 4096.0  # charts that fill less of their rectangle are cut, if it has so many photo pixels
 CUTS = 16  # rounds of cutting
+NEAR = (16, 32, 64)  # photo pixels: small charts in a square of such a side share a rectangle, if that needs less room
 CELL = 3  # texels to each side of the cell of an unseen triangle: interpolation never leaves it
 CELLS_ACROSS = 256  # cells in a row of a chart of unseen triangles, and rows
 ROUNDS = 40  # of bisection for the texels' size
@@ -67,7 +70,7 @@ def make_charts(
     seen = np.flatnonzero(label != NONE)
     places, pixel_m = _project(mesh, label, sources)
     _, part = connected_parts(beyond, same_label(label, beyond))
-    part = _cut(part[seen], places[seen])
+    part = _shared(_cut(part[seen], places[seen]), label[seen], places[seen])
     _, first, part = np.unique(part, return_index=True, return_inverse=True)
     photo = label[seen][first]
     order = np.lexsort((first, photo))  # by photo, so that a page needs few
@@ -138,6 +141,31 @@ def _cut(part: np.ndarray, places: Float64[np.ndarray, "s 3 2"]) -> Int64[np.nda
         beyond = np.take_along_axis(centre, axis[part][:, None], axis=1)[:, 0] > middle[part]
         part = 2 * part.astype(np.int64) + (beyond & cut[part])
     return part.astype(np.int64)
+
+
+def _shared(
+    part: Int64[np.ndarray, " s"], photo: Labels, places: Float64[np.ndarray, "s 3 2"]
+) -> Int64[np.ndarray, " s"]:
+    """Join small charts that lie near each other in their photo."""
+    for side in NEAR:
+        _, first, part = np.unique(part, return_index=True, return_inverse=True)
+        low, high = _boxes(part, places, len(first))
+        square = np.floor((low + high) / (2.0 * side)).astype(np.int64)
+        square[(high - low).max(axis=1) > side] = -1 - np.arange(len(first))[(high - low).max(axis=1) > side, None]
+        keys = np.column_stack([photo[first].astype(np.int64), square])
+        _, group = np.unique(keys, axis=0, return_inverse=True)
+        group = group.ravel()
+        count = int(group.max(initial=-1)) + 1
+        least, most = _boxes(group[part], places, count)
+        apart = np.bincount(group, _texels(low, high), count)
+        joined = _texels(least, most) <= apart
+        part = np.where(joined[group], group, count + np.arange(len(first)))[part]
+    return part
+
+
+def _texels(low: Float64[np.ndarray, "c 2"], high: Float64[np.ndarray, "c 2"]) -> Float64[np.ndarray, " c"]:
+    """Texels of charts at full resolution, with their borders."""
+    return np.asarray(_sizes(high - np.floor(low), np.ones(len(low))).astype(np.float64).prod(axis=1))
 
 
 def _sizes(extent: Float64[np.ndarray, "c 2"], scale: Float64[np.ndarray, " c"]) -> Int32[np.ndarray, "c 2"]:

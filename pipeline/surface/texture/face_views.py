@@ -111,11 +111,18 @@ def _turn_up(direction: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]
 
 
 @dataclass(frozen=True, eq=False)
-class _Rating:
-    """The triangles that a photo sees: their places in ``FaceSamples``' order, and what it costs there."""
+class FaceRating:
+    """What a photo costs on triangles.
+
+    Attributes:
+        rows: Their places in ``FaceSamples``' order.
+        cost: Mean cost of their samples, thousandths.
+        seen: Whether the photo's depths confirm that it sees the centre; if not, it may be hidden there, or unknown.
+    """
 
     rows: Int64[np.ndarray, " k"]
     cost: UInt16[np.ndarray, " k"]
+    seen: Bool[np.ndarray, " k"]
 
 
 def rate_faces(photos: PhotoSet, faces: FaceSamples, cell_m: float, threads: int, report: Reporter) -> FaceViews:
@@ -151,12 +158,31 @@ def rate_faces(photos: PhotoSet, faces: FaceSamples, cell_m: float, threads: int
     return FaceViews(found.photo[back], found.cost[back], found.colour[back])
 
 
-def _rate_photo(photos: PhotoSet, faces: FaceSamples, cell_m: float, number: int) -> _Rating:
-    camera, found = photos.sources[number].camera, photos.depth_map(number)
-    view = view_pieces(camera, SurfacePieces(faces.points[0], faces.normal))
+def _rate_photo(photos: PhotoSet, faces: FaceSamples, cell_m: float, number: int) -> FaceRating:
+    """The triangles that a photo sees."""
+    view = view_pieces(photos.sources[number].camera, SurfacePieces(faces.points[0], faces.normal))
     rows = np.flatnonzero(np.isfinite(view.footprint) & (view.place.sine > MIN_COSINE))
-    sines = np.ascontiguousarray(view.place.sine[rows])
+    found = rate_rows(photos, faces, cell_m, number, rows)
+    return FaceRating(found.rows[found.seen], found.cost[found.seen], found.seen[found.seen])
+
+
+def rate_rows(
+    photos: PhotoSet, faces: FaceSamples, cell_m: float, number: int, rows: Int64[np.ndarray, " k"]
+) -> FaceRating:
+    """Rate a photo on some triangles.
+
+    Args:
+        photos: Photos with depths.
+        faces: The triangles.
+        cell_m: Resolution that photos are to have on them, metres.
+        number: The photo.
+        rows: Places in the triangles' order, increasing.
+    """
+    camera, found = photos.sources[number].camera, photos.depth_map(number)
+    view = view_pieces(camera, SurfacePieces(faces.points[0][:, rows], faces.normal[:, rows]))
+    sines = np.ascontiguousarray(view.place.sine)
     total, seen = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.bool_)
+    centre = np.zeros(len(rows), np.uint16)
     ends = np.searchsorted(rows, faces.starts)
     for number_of_sample, points in enumerate(faces.points):
         east, north, up = points[:, rows]
@@ -169,8 +195,9 @@ def _rate_photo(photos: PhotoSet, faces: FaceSamples, cell_m: float, number: int
             cost, visible = rate_points(_turned(camera, turn), (x, y, z), cell_m, flags[part])
             total[part] += cost
             if number_of_sample == 0:
-                seen[part] = visible
-    return _Rating(rows[seen], (total[seen] // len(SAMPLES)).astype(np.uint16))
+                seen[part], centre[part] = visible, cost
+    facing = np.isfinite(view.footprint) & (view.place.sine > MIN_COSINE) & (centre < HIDDEN)
+    return FaceRating(rows, np.where(facing, total // len(SAMPLES), HIDDEN).astype(np.uint16), seen & facing)
 
 
 def _turned(camera: Camera, turn: Float64[np.ndarray, "3 3"]) -> Camera:

@@ -23,6 +23,7 @@ from splatpipe.pipeline.surface.texture.charts import make_charts
 from splatpipe.pipeline.surface.texture.face_choice import Labels, choose_photos
 from splatpipe.pipeline.surface.texture.face_graph import adjacent_faces, reachable_from_borders
 from splatpipe.pipeline.surface.texture.face_views import NONE, rate_faces, sample_faces
+from splatpipe.pipeline.surface.texture.neighbour_photos import FaceNeighbours, NeighbourPhotos
 from splatpipe.pipeline.surface.texture.packing import pack_charts
 from splatpipe.pipeline.surface.texture.page_colours import TextureInput, colour_page
 from splatpipe.pipeline.surface.texture.seams import blend_seams
@@ -90,10 +91,13 @@ def _choose(
     """The photo of each triangle, and the list of those that see it."""
     if not kept.is_file():
         mesh = coloured.mesh
-        views = rate_faces(photos, sample_faces(mesh), task.cell_m, task.threads, report)
-        label = choose_photos(views, beyond, mesh.areas(), LEAST_CELLS * task.cell_m**2)
+        faces, least_m2 = sample_faces(mesh), LEAST_CELLS * task.cell_m**2
+        views = rate_faces(photos, faces, task.cell_m, task.threads, report)
+        label = choose_photos(views, beyond, mesh.areas(), least_m2)
+        neighbours = NeighbourPhotos(photos, faces, views, task.cell_m, task.threads)
+        neighbours.join(label, FaceNeighbours(beyond, mesh.areas(), least_m2))
         save_arrays(kept, label=label, listed=views.photo)
-        del views
+        del views, faces, neighbours
         return_free_heap()  # half a gigabyte, before pages are drawn
     with open_archive(kept) as arrays:
         return arrays["label"], arrays["listed"]

@@ -30,8 +30,8 @@ class Atlas:
     Attributes:
         corners: Column and row of each triangle's corners in its page, pixels; the first pixel's centre is (0.5, 0.5),
             rows go down.
-        chart: Chart of each triangle. The triangles of a chart lie inside of its rectangle and do not share its pixels
-            with those of other charts.
+        chart: Chart of each triangle. The triangles of a chart, which need not be connected, lie inside of its
+            rectangle and do not share its pixels with those of other charts.
         rects: Page, left, top, width, height of each chart in pixels, with a border that its triangles do not reach.
         sizes: Width and height of each page, pixels.
     """

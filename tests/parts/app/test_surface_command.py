@@ -42,6 +42,8 @@ def test_a_finished_run_is_cut_and_measured(demo_copy: Path, tmp_path: Path) -> 
     assert code == 0
     assert all(stage["state"] == "reused" for stage in output["stages"])
     section, _ = output["surface"]["sections"]
+    with (out / "sections" / section["csv"]).open(encoding="utf-8") as file:
+        assert file.readline().strip().endswith("ground_m,over_ground_m")
     assert section["length_m"] == pytest.approx(30.0, abs=0.05)
     for kind in ("csv", "dxf", "picture"):
         assert (out / "sections" / section[kind]).stat().st_size > 500
@@ -55,6 +57,12 @@ def test_a_finished_run_is_cut_and_measured(demo_copy: Path, tmp_path: Path) -> 
     assert volume["area_m2"] == pytest.approx(576.0, rel=0.01)
     assert 300.0 < volume["cut_m3"] < 2000.0  # the house of 13 by 9 metres, 8 high, on a lawn
     assert volume["cut_sigma_m3"] < 0.1 * volume["cut_m3"]
+    with plain_reports():
+        assert surface(out, "--volume", str(tmp_path / "heap.geojson"), "--base", "ground")[0] == 0
+    (over_ground,) = json.loads((out / "volumes.json").read_text())["volumes"]
+    assert (over_ground["base"], over_ground["model"]) == ({"kind": "ground"}, "dsm")
+    assert over_ground["cut_m3"] == pytest.approx(volume["cut_m3"], rel=0.25)  # the plot is level
+    assert over_ground["fill_m3"] < 1.0
 
     def files() -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in [*(out / "sections").iterdir(), out / "viewer.html"]}
@@ -176,6 +184,20 @@ def test_other_bases_are_refused(base: str) -> None:
     with pytest.raises(UsageError):
         MeasurementRequest.of([], None, base)
     assert MeasurementRequest.of([], None, "512.5").base == 512.5
+
+
+def test_the_ground_is_made_where_it_is_needed(tmp_path: Path) -> None:
+    polygons = tmp_path / "heap.geojson"
+    polygons.write_text("{}")
+    asked = {
+        (base, model): MeasurementRequest.of([], polygons, base, model).products
+        for base, model in (("rim", "dsm"), ("ground", "dsm"), ("rim", "dtm"))
+    }
+    assert list(asked.values()) == ["dsm", "dtm", "dtm"]
+    assert MeasurementRequest.of(["1,2,3,4"], None, "ground").products == "dsm"
+    for base, model in (("ground", "dtm"), ("rim", "chm")):
+        with pytest.raises(UsageError):
+            MeasurementRequest.of([], polygons, base, model)
 
 
 @pytest.mark.parametrize(("text", "metres"), [("2cm", 0.02), ("25mm", 0.025), ("0.1m", 0.1), (" 5 cm ", 0.05)])

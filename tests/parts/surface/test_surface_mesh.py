@@ -12,20 +12,26 @@ import plyfile
 import pytest
 import trimesh
 from house_photos import GSD_M, Recorder, house_site, photos, run_surface, surface_distances
-from house_site import true_height, true_orthophoto
+from house_site import ExactDepths, true_height, true_orthophoto
 from PIL import Image
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.surface.depths.photo_set import PhotoSet
+from splatpipe.pipeline.surface.depths.sources import DepthSource
 from splatpipe.pipeline.surface.shapes.blocks import SIDE, blocks_of, keys_of, surface_blocks
 from splatpipe.pipeline.surface.shapes.decimation import decimate
 from splatpipe.pipeline.surface.shapes.point_colours import photo_set
 from splatpipe.pipeline.surface.shapes.surface_mesh import MeshTask, vertex_colours
 from splatpipe.pipeline.surface.shapes.triangles import ColouredMesh, TriangleMesh, in_order, remove_small_components
+from splatpipe.pipeline.surface.texture.charts import BORDER, make_charts
+from splatpipe.pipeline.surface.texture.face_choice import same_label
+from splatpipe.pipeline.surface.texture.face_graph import adjacent_faces, connected_parts
+from splatpipe.pipeline.surface.texture.face_views import NONE, FaceViews, rate_faces, sample_faces
 from splatpipe.pipeline.surface.texture.mesh_files import write_mesh
 from splatpipe.pipeline.surface.texture.mesh_product import TexturedMeshTask, make_mesh
+from splatpipe.pipeline.surface.texture.neighbour_photos import FaceNeighbours, NeighbourPhotos
 from splatpipe.pipeline.surface.texture.texture import TextureTask, texture_mesh
 from splatpipe.pipeline.surface.texture.textured_mesh import Atlas, TexturedMesh, load_textured_mesh, page_paths
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin
@@ -220,6 +226,72 @@ def test_textures_show_the_photos_where_they_see_the_mesh_and_nothing_else(tmp_p
     (tmp_path / "choice.npz").unlink()
     small = texture_mesh(replace(task, most_texels=120.0), coloured, tmp_path, tmp_path, Recorder())
     assert small.atlas.rects[:, 3:].prod(axis=1).sum() <= 120 < atlas.rects[:, 3:].prod(axis=1).sum()
+
+
+def lonely_triangle() -> tuple[TriangleMesh, FaceViews, np.ndarray, int]:
+    """Lawn that shows one photo, but for a triangle that shows another and knows no other; and that triangle's row."""
+    lawn = flat_mesh(-4.9, 6, 0.2)
+    mesh = TriangleMesh(lawn.vertices - [0.0, 4.9, 0.0], lawn.triangles)
+    views = rate_faces(exact_photos(), sample_faces(mesh), GSD_M, 1, Recorder())
+    everywhere = [number for number in range(len(photos())) if (views.photo == number).any(axis=1).all()]
+    label, lonely = np.full(len(mesh.triangles), everywhere[0], np.int16), 20
+    label[lonely] = everywhere[1]
+    at = int(np.flatnonzero(views.photo[lonely] == everywhere[1])[0])
+    views.photo[lonely, 0], views.photo[lonely, 1:] = everywhere[1], NONE
+    views.cost[lonely, 0], views.colour[lonely, 0] = views.cost[lonely, at], views.colour[lonely, at]
+    return mesh, views, label, lonely
+
+
+@pytest.mark.parametrize(("hole", "odd", "joined"), [(False, 90, True), (True, 0, True), (True, 90, False)])
+def test_a_lonely_triangle_takes_its_neighbours_photo_if_that_shows_it(hole: bool, odd: int, joined: bool) -> None:
+    """Where the photo's depths have a hole it is believed only if it shows the same colour."""
+    mesh, views, label, lonely = lonely_triangle()
+    common = int(label[0])
+    sources = photos()
+    if hole:
+        found = sources[common].depths.load()
+        depth = np.zeros_like(found.depth)
+        camera = replace(found.camera)
+        source = DepthSource(camera, lambda: ExactDepths(camera, depth, found.confidence))
+        sources[common] = replace(sources[common], depths=source)
+    views.colour[lonely, 0] = np.minimum(views.colour[lonely, 0].astype(int) + odd, 255)
+    asked = NeighbourPhotos(photo_set(sources, GSD_M, 1), sample_faces(mesh), views, GSD_M, 1)
+    asked.join(label, FaceNeighbours(adjacent_faces(mesh.triangles), mesh.areas(), 1.0))
+    assert (label[lonely] == common) == joined and (np.delete(label, lonely) == common).all()
+    assert (common in views.photo[lonely]) == joined  # seams may mix it
+
+
+def test_triangles_without_a_photo_go_on_from_those_beside_unless_something_else_is_there() -> None:
+    mesh, views, label, lonely = lonely_triangle()
+    label[:] = label[0]
+    hidden = together(mesh, TriangleMesh(mesh.vertices - np.array([0.0, 0.0, 3.0]), mesh.triangles))  # below the lawn
+    beyond = adjacent_faces(hidden.triangles)
+    beyond[lonely, 0], beyond[lonely + 72, 0] = lonely + 72, lonely
+    every = np.concatenate([label, np.full(72, NONE, np.int16)])
+    every[lonely] = NONE
+    both = FaceViews(
+        *(
+            np.concatenate([each, np.full_like(each, NONE if k == 0 else 0)])
+            for k, each in enumerate(vars(views).values())
+        )
+    )
+    both.photo[lonely] = NONE
+    asked = NeighbourPhotos(exact_photos(), sample_faces(hidden), both, GSD_M, 1)
+    asked.join(every, FaceNeighbours(beyond, hidden.areas(), 1.0))
+    assert (every[:72] == label[0]).all() and (every[72:] == NONE).all()
+
+
+def test_small_charts_near_each_other_share_a_rectangle_if_that_needs_less_room() -> None:
+    lawn = flat_mesh(-4.9, 12, 0.2)
+    mesh = TriangleMesh(lawn.vertices - [0.0, 4.9, 0.0], lawn.triangles)
+    beyond = adjacent_faces(mesh.triangles)
+    label = (np.arange(len(mesh.triangles)) % 2).astype(np.int16)  # no two neighbours along a row show the same photo
+    charts = make_charts(mesh, label, beyond, photos(), 1e6)
+    alone, _ = connected_parts(beyond, same_label(label, beyond))
+    assert len(charts.photo) < alone / 4
+    assert (charts.photo[charts.chart] == label).all()
+    inside = (charts.corners >= BORDER - 1e-3) & (charts.corners <= charts.size[charts.chart, None] - BORDER)
+    assert inside.all()
 
 
 def test_few_triangles_are_unchanged() -> None:

@@ -17,13 +17,24 @@ RASTERS, OTHERS = (
 PRODUCTS = dict.fromkeys(RASTERS, "MachineError") | dict.fromkeys(OTHERS, "OSError")
 
 
+def run_program(name: str, folder: Path) -> list[str]:
+    """Run a program beside this file, and return its lines."""
+    command = [sys.executable, str(Path(__file__).with_name(name)), str(folder)]
+    paths = environment(SCENES, ROOT / "benchmarks/formats")
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=paths).stdout.splitlines()
+
+
+def test_products_killed_again_and_again_go_on_to_the_same_bits(tmp_path: Path) -> None:
+    said = run_program("killed_products.py", tmp_path)
+    for name, kills in {"terrain": 3, "textures": 3, "publication": 5}.items():
+        ended = [line for line in said if line.startswith(f"{name} ended")]
+        assert ended == [*[f"{name} ended -9"] * kills, f"{name} ended 0"]
+        (told,) = (line.split() for line in said if line.startswith(f"{name} kept"))
+        assert int(told[2]) > 0 and told[3] == "same", told
+
+
 def test_kills_and_full_disks_leave_no_half_product(tmp_path: Path) -> None:
-    program = Path(__file__).parent / "killed_surface.py"
-    command = [sys.executable, str(program), str(tmp_path)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=True, env=environment(SCENES, ROOT / "benchmarks/formats")
-    )
-    said = done.stdout.splitlines()
+    said = run_program("killed_surface.py", tmp_path)
     for name, error in PRODUCTS.items():
         assert f"{name} {error}" in said and f"{name} fill_the_disk 0 0" in said
         assert any(line.startswith(f"{name} die -9 ") for line in said)

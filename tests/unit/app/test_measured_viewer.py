@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from splatpipe.pipeline.app import measurements
-from splatpipe.pipeline.app.measured_viewer import update_viewer
+from splatpipe.pipeline.app import measured_viewer, measurements
+from splatpipe.pipeline.app.measured_viewer import SHOWN, update_viewer
 from splatpipe.pipeline.app.measurements import MEASURED, outdated, read_measurements, write_measurements
 from splatpipe.pipeline.app.report.chapters.surfaces import measures
 from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
@@ -155,6 +155,23 @@ def test_mesh_and_points_are_in_the_page_and_beside_the_sites_page(out: Path) ->
     assert (out / "viewer.html").stat() == stamp and (out / "viewer.html").read_bytes() == content
 
 
+def test_pages_that_show_everything_are_not_read_again(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish(out, frame_of(out), {"mesh": {}})
+    assert update_viewer(out) == ""
+    read = []
+    monkeypatch.setattr(measured_viewer, "_update", lambda *page: read.append(page))
+    assert update_viewer(out) == "" and not read
+    (out / SHOWN).write_text("[" * 100_000)
+    update_viewer(out)
+    assert len(read) == 1
+    (out / "viewer.html").write_bytes(PLAIN)
+    update_viewer(out)
+    assert len(read) == 2
+    (out / "volumes.json").unlink()
+    update_viewer(out)
+    assert len(read) == 3
+
+
 @pytest.mark.parametrize("surfaces", ["", "no JSON", "[]", "{}"])
 def test_without_mesh_and_points_the_page_has_none(out: Path, surfaces: str) -> None:
     publish(out, frame_of(out), surfaces)
@@ -230,6 +247,18 @@ def test_the_report_rounds_figures_to_their_uncertainty(out: Path) -> None:
     make(Store(out), DSM, {}, "newer ")
     embedded = measures(read_report_inputs(out))
     assert (embedded["sections"], embedded["volumes"], embedded["outdated"]) == ([], [], True)
+
+
+def test_a_damaged_ground_hides_its_section_only(out: Path) -> None:
+    value = json.loads((out / MEASURED).read_text())
+    value["sections"]["items"][0]["trace"]["ground"] = [1.0, 1.0, None, 1.0]
+    (out / MEASURED).write_text(json.dumps(value))
+    update_viewer(out)
+    assert embedded(out)["sections"][0]["trace"]["ground"] == [1.0, 1.0, None, 1.0]
+    value["sections"]["items"][0]["trace"]["ground"] = [1.0, "2"]
+    (out / MEASURED).write_text(json.dumps(value))
+    update_viewer(out)
+    assert not embedded(out)["sections"] and embedded(out)["volumes"]
 
 
 def changed(item: dict[str, Any], **members: Any) -> dict[str, Any]:

@@ -38,11 +38,20 @@ def house(folder: Path) -> SurfaceFile:
     places = grid().centres_in_local(tile, np.full((grid().height, grid().width), 512.0))
     up = true_height(places[..., 0], places[..., 1])
     up = np.where((np.abs(places[..., 1] + 6.0) < 0.5) & (np.abs(places[..., 0]) < 2.0), np.nan, up + 512.0)
+    return written(folder / "dsm.tif", up)
+
+
+def bare_ground(folder: Path) -> SurfaceFile:
+    """The ground without the house."""
+    return written(folder / "dtm.tif", np.full((grid().height, grid().width), 512.0))
+
+
+def written(path: Path, up: np.ndarray) -> SurfaceFile:
     size = {"width": grid().width, "height": grid().height, "count": 1, "dtype": "float32", "nodata": -9999.0}
     crs = grid().crs.horizontal
-    with rasterio.open(folder / "dsm.tif", "w", driver="GTiff", transform=grid().transform, crs=crs, **size) as file:
+    with rasterio.open(path, "w", driver="GTiff", transform=grid().transform, crs=crs, **size) as file:
         file.write(np.where(np.isfinite(up), up, -9999.0).astype(np.float32), 1)
-    return open_surface(folder / "dsm.tif")
+    return open_surface(path)
 
 
 def line_of(*local: float) -> tuple[float, float, float, float]:
@@ -156,6 +165,23 @@ def test_files_are_read_by_other_programs(tmp_path: Path) -> None:
     before = (tmp_path / facts["picture"]).read_bytes(), (tmp_path / facts["dxf"]).read_bytes()
     write_section(tmp_path, "section-1", section, grid().crs)
     assert before == ((tmp_path / facts["picture"]).read_bytes(), (tmp_path / facts["dxf"]).read_bytes())
+
+
+def test_the_ground_is_a_second_line(tmp_path: Path) -> None:
+    section = cut_section(house(tmp_path), line_of(*ACROSS), grid().crs, (), 1, bare_ground(tmp_path))
+    assert section.ground is not None
+    assert np.allclose(section.ground, 512.0)
+    facts = write_section(tmp_path, "section-1", section, grid().crs)
+    with (tmp_path / facts["csv"]).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0])[-2:] == ["ground_m", "over_ground_m"]
+    assert float(rows[len(rows) // 2]["over_ground_m"]) == pytest.approx(5.0, abs=0.05)
+    assert float(rows[5]["over_ground_m"]) == pytest.approx(0.0, abs=2e-3)
+    names = pyogrio.raw.read(tmp_path / facts["dxf"], columns=["Layer"], force_2d=True)[3][0].tolist()
+    assert names.count("GROUND") == 1
+    assert names.count("SURFACE") == 2
+    trace = section_trace(section, grid().crs, 80)
+    assert trace["ground"] == [512.0] * len(trace["distance"])
 
 
 @pytest.mark.parametrize("local", [(1.0, 1.0, 1.0, 1.0), (200.0, 0.0, 300.0, 0.0), (0.0, 0.0, 9e6, 0.0)])

@@ -17,7 +17,7 @@ SECTION_SIDE = 720
 MAX_SECTIONS = 12  # with a drawing; the list has all
 QUALITY = 85
 MAX_ROWS = 200  # volumes in the table; the file has all of them
-BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated"}
+BASES = {"rim": "rim", "lowest": "lowest", "stated": "stated", "ground": "ground"}
 SIGMA_DIGITS = 2  # significant digits of a standard deviation
 
 Chapter = dict[str, Any]
@@ -173,6 +173,7 @@ def _volume(item: dict[str, Any]) -> dict[str, Any]:
     amounts = {kind: _with_sigma(item[f"{kind}_m3"], item[f"{kind}_sigma_m3"]) for kind in ("cut", "fill", "net")}
     height = item["base"].get("height_m")
     where = f", {height:.2f} m" if isinstance(height, float) else ""
+    where += "; heights of the ground" if item.get("model") == "dtm" else ""
     return {
         "name": title_of(item),
         "area": f"{item['area_m2']:.1f} m²",

@@ -44,7 +44,7 @@ export class Chart {
   /** @param {object} trace Columns of a section, see traces.py. */
   show(trace) {
     this.trace = trace;
-    const known = [...trace.height, ...trace.point_height].filter((height) => height !== null);
+    const known = [...trace.height, ...(trace.ground ?? []), ...trace.point_height].filter((height) => height !== null);
     const [low, high] = [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))];
     const spare = Math.max(0.06 * (high - low), (MIN_RANGE_M - (high - low)) / 2);
     this.across = [0, trace.distance.at(-1)];
@@ -54,7 +54,8 @@ export class Chart {
     this.drawing.replaceChildren(
       ...this.grid(),
       svg("path", { class: "seen", d: trace.point_distance.map((at, i) => `M${this.place(at, trace.point_height[i])}h0`).join("") }),
-      svg("path", { class: "profile", d: this.profile() }),
+      svg("path", { class: "ground", d: this.profile(trace.ground ?? []) }),
+      svg("path", { class: "profile", d: this.profile(trace.height) }),
       this.cursor,
       this.dot,
     );
@@ -80,8 +81,8 @@ export class Chart {
     return `${this.x(distance).toFixed(1)} ${this.y(height).toFixed(1)}`;
   }
 
-  profile() {
-    const { distance, height } = this.trace;
+  profile(height) {
+    const { distance } = this.trace;
     return height.map((up, i) => (up === null ? "" : `${i && height[i - 1] !== null ? "L" : "M"}${this.place(distance[i], up)}`)).join("");
   }
 

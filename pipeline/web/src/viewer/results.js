@@ -28,8 +28,9 @@ function sectionLines({ length_m, share_with_height, height_sigma_m }) {
 
 function volumeLines(facts) {
   const volume = (kind) => `${withSigma(facts[`${kind}_m3`], facts[`${kind}_sigma_m3`])} m³`;
-  const base = { rim: "the plane through the rim", lowest: "the lowest point of the rim", stated: "a stated height" }[facts.base];
-  return [`net ${volume("net")}`, `cut ${volume("cut")}, fill ${volume("fill")}`, `${facts.area_m2.toFixed(1)} m², over ${base ?? "a base"}`];
+  const base = { rim: "the plane through the rim", lowest: "the lowest point of the rim", stated: "a stated height", ground: "the ground" }[facts.base];
+  const over = `${facts.area_m2.toFixed(1)} m²${facts.model === "dtm" ? " of ground" : ""}, over ${base ?? "a base"}`;
+  return [`net ${volume("net")}`, `cut ${volume("cut")}, fill ${volume("fill")}`, over];
 }
 
 /** The part of the window not covered by the list and the photos, CSS pixels. */
@@ -116,7 +117,9 @@ export class Results {
     }
     const [height, sigma] = [trace.height[index], trace.sigma[index]];
     const heightText = height === null ? "no height here" : `height ${height.toFixed(2)} m${sigma === null ? "" : ` ± ${length(sigma)}`}`;
-    reading.textContent = `${trace.distance[index].toFixed(2)} m: ${heightText}`;
+    const ground = trace.ground?.[index] ?? null;
+    const overText = height === null || ground === null ? "" : `, ${Math.max(0, height - ground).toFixed(2)} m over the ground`;
+    reading.textContent = `${trace.distance[index].toFixed(2)} m: ${heightText}${overText}`;
     this.traces.point(height === null ? null : new Vector3(trace.x[index], trace.y[index], trace.z[index]));
   }
 
