@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -32,7 +31,7 @@ from splatpipe.pipeline.train.densify import (
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, Checkpoint, HostArrays
-from splatpipe.pipeline.train.state.density import Density, DensityStep
+from splatpipe.pipeline.train.state.density import Density
 from splatpipe.pipeline.train.state.history import History
 from splatpipe.pipeline.train.state.memory import within_room
 from splatpipe.pipeline.train.techniques.techniques import Techniques
@@ -205,24 +204,15 @@ class TrainState:
         """Give the model the rows that density control chooses, at most ``limit`` if it adds any."""
         _native.free_frames()  # they change size in this step, and memory is tight until then
         try:
-            growth, counts = self._growth(plan, limit, iteration)
+            growth, counts = self.density.control(  # no name for the old model: it is freed part by part below
+                self.gaussians.detach(), plan.schedule.density, plan.extent, limit, iteration, self.techniques
+            )
+            growth = along_curve(growth)
         except torch.OutOfMemoryError:  # the device has not even room to select what to grow
             self.history.growth_ended = self.history.growth_ended or iteration
             return
         self._adopt_growth(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
-
-    def _growth(self, plan: TrainingPlan, limit: int, iteration: int) -> tuple[DensifiedGaussians, dict[str, int]]:
-        """The rows that density control chooses, and its counts; changes nothing."""
-        gaussians = self.gaussians.detach()
-        gone = self.techniques.prune_mask(gaussians, iteration)
-        if gone is None:
-            gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-        schedule = plan.schedule.density
-        score_adjustment = partial(self.techniques.adjust_scores, gaussians=gaussians, schedule=schedule)
-        step = DensityStep(schedule, plan.extent, limit, iteration, gone, score_adjustment)
-        growth, counts = self.density.control(gaussians, step)
-        return along_curve(growth), counts
 
     def _clear(self, iteration: int) -> None:
         """Remove the Gaussians that a technique rejects; this goes on after the last step of density control."""

@@ -215,7 +215,8 @@ def test_growth_ends_when_the_device_has_no_memory_left(monkeypatch: pytest.Monk
     monkeypatch.setattr(state, "within_room", lambda wanted, gaussians, frozen: len(gaussians) + 3)
     plan = make_small_plan(ALL)
     training = TrainState.begin(tiny_scene.true_model(), plan, Techniques())
-    training.density.statistics.add(torch.ones(len(training.gaussians)), torch.ones(len(training.gaussians)) > 0.0)
+    training.density.score_sum += 1.0
+    training.density.seen += 1.0
     training.control_density(plan, plan.schedule.density.first)
     assert training.history.growth_ended == plan.schedule.density.first
     assert len(training.gaussians) == tiny_scene.GAUSSIANS + 3

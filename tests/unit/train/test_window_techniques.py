@@ -158,7 +158,7 @@ def scores(photos: list[TrainingPhoto], magnitudes: bool) -> tuple[Tensor, Tenso
         photo_loss(rendered.colour, photo.colour, SSIM_WEIGHT, photo.mask, photo.inner).backward()
         assert probe.grad is not None
         density.observe(rendered, probe.grad, schedule, photo)
-    return density.statistics.score_sum, density.statistics.seen
+    return density.score_sum, density.seen
 
 
 @pytest.mark.parametrize("magnitudes", [True, False])
