@@ -30,7 +30,6 @@ class Density:
 
     Args:
         count: Number of Gaussians in the model.
-        magnitudes: Rank by the summed magnitudes of the pixels' gradients, not by their signed sum.
         device: The model's device; None for the CPU.
 
     Attributes:
@@ -39,8 +38,7 @@ class Density:
         max_radius_px: (n,) largest radius on screen; 0 where unseen.
     """
 
-    def __init__(self, count: int, magnitudes: bool, device: torch.device | None = None) -> None:
-        self.magnitudes = magnitudes
+    def __init__(self, count: int, device: torch.device | None = None) -> None:
         self.score_sum, self.seen, self.max_radius_px = (torch.zeros(count, device=device) for _ in range(3))
 
     def observe(
@@ -57,7 +55,7 @@ class Density:
 
         Args:
             rendered: The render compared with the photo, cut down to the n trained Gaussians.
-            gradient_px: With respect to the image-plane means, pixels; with ``magnitudes``, the summed magnitudes.
+            gradient_px: With respect to the image-plane means, pixels, or their summed magnitudes.
                 Either sparse, of the trained and visible Gaussians, or of all rendered ones, the n trained ones first.
             schedule: The density-control schedule.
             photo: The photo trained on.

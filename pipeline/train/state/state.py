@@ -88,18 +88,17 @@ class TrainState:
         sh[:, :shared] = start.sh[:, :shared]
         model = start.clone()
         model.sh = sh
-        return TrainState.of(model, plan, History(), techniques, frozen)
+        return TrainState.of(model, History(), techniques, frozen)
 
     @staticmethod
     def of(
         gaussians: Gaussians,
-        plan: TrainingPlan,
         history: History,
         techniques: Techniques,
         frozen: Gaussians | None = None,
     ) -> TrainState:
-        """A state of these Gaussians with everything else that the plan needs, untrained."""
-        density = Density(len(gaussians), plan.options.density == "absolute", gaussians.means.device)
+        """A state of these Gaussians with everything else untrained."""
+        density = Density(len(gaussians), gaussians.means.device)
         state = TrainState(gaussians, Adam(gaussians.tensors()), density, history, techniques=techniques)
         state._draw(gaussians, frozen)
         return state
@@ -303,7 +302,7 @@ class TrainState:
             gaussians = model.to(device)
             if gaussians.sh.shape[1] != coefficient_count(plan.options.sh_degree):
                 raise ValueError("another degree of spherical harmonics")
-            state = TrainState.of(gaussians, plan, History(**checkpoint.facts["history"]), techniques, frozen)
+            state = TrainState.of(gaussians, History(**checkpoint.facts["history"]), techniques, frozen)
             state.adam.load_state_dict(_under(_ADAM, tensors))
             state.iteration, state.seconds = int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"])
             state.density.load(_under(_DENSITY, tensors))

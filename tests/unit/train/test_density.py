@@ -42,7 +42,7 @@ def picture(seed: int = 1) -> Tensor:
 
 def observed(magnitudes: bool, gaussians: Gaussians, weights: Tensor) -> Tensor:
     """The score after one photo whose loss is Σ weights · colour."""
-    density = Density(len(gaussians), magnitudes)
+    density = Density(len(gaussians))
     probe = torch.zeros(len(gaussians), 2, requires_grad=True)
     options = rasterizer.RenderOptions(0, near=0.2, depth=False, magnitudes=magnitudes)
     render = rasterizer.render(gaussians.requires_grad_(), CAMERA, options, means2d_probe=probe)
@@ -82,10 +82,9 @@ def test_gradient_scores_are_those_of_the_reference(magnitudes: bool) -> None:
     torch.testing.assert_close(observed(magnitudes, gaussians, weights).double(), expected, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("magnitudes", [False, True])
-def test_density_control_keeps_to_the_limit_and_its_statistics_survive(magnitudes: bool) -> None:
+def test_density_control_keeps_to_the_limit_and_its_statistics_survive() -> None:
     schedule = replace(SCHEDULE, gradient=1e-9)
-    gaussians, density, again = scene(50), Density(50, magnitudes), Density(50, magnitudes)
+    gaussians, density, again = scene(50), Density(50), Density(50)
     density.score_sum += 1.0
     density.seen += 1.0
     again.load({key: tensor.clone() for key, tensor in density.to_arrays().items()})
@@ -101,7 +100,7 @@ def test_density_control_keeps_to_the_limit_and_its_statistics_survive(magnitude
 
 
 def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
-    density, camera = Density(3, False), Camera("photo.png", 200, 200, 1.0, 1.0, 100.0, 100.0, np.eye(4))
+    density, camera = Density(3), Camera("photo.png", 200, 200, 1.0, 1.0, 100.0, 100.0, np.eye(4))
     schedule, photo = replace(SCHEDULE, prune_screen_px=1.0), TrainingPhoto(camera, torch.zeros(200, 200, 3), None)
     visible, picture = torch.tensor([True, False, True]), torch.zeros(200, 200)
     gradient = torch.tensor([[3e-3, 4e-3], [1.0, 1.0], [math.nan, 0.0]])
@@ -113,6 +112,6 @@ def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> Non
 
 
 def test_statistics_of_another_model_are_refused() -> None:
-    density = Density(3, True)
+    density = Density(3)
     with pytest.raises(RuntimeError, match="not"):
-        density.load(Density(4, True).to_arrays())
+        density.load(Density(4).to_arrays())
