@@ -91,6 +91,14 @@ def moment(seconds: object) -> str:
         return NONE
 
 
+def local_moment(seconds: float) -> str:
+    """A point in time in this machine's time zone, with the zone."""
+    try:
+        return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
+    except (OverflowError, OSError, ValueError):
+        return "at an unknown time"
+
+
 def interval(bounds: object) -> str:
     """The 95 % confidence interval."""
     if not isinstance(bounds, list | tuple) or len(bounds) != 2:
