@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
-from splatpipe.pipeline.app.terminal.parameters import expand_user
+from splatpipe.pipeline.app.terminal.parameters import expand_given
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.files.output_file import own_folder
 
@@ -51,7 +51,7 @@ class RenderRequest:
         typer.Option(
             "--output",
             "-o",
-            callback=lambda path: path and expand_user(path),
+            callback=expand_given,
             help="Film file (.webm, or .mp4, four times slower) or folder of stills. Default: in OUT/renders.",
         ),
     ] = None

@@ -38,7 +38,7 @@ from splatpipe.pipeline.app.terminal.parameters import (
     SessionOptions,
     SetOption,
     UntilOption,
-    expand_user,
+    expand_given,
     stages,
 )
 from splatpipe.pipeline.app.terminal.summary import CommandSummary, for_the_user, print_json, status_as_json
@@ -348,7 +348,7 @@ def options(preset: PresetOption = "standard") -> None:
 def doctor(
     out: Annotated[
         Path | None,
-        typer.Argument(callback=lambda path: path and expand_user(path), help="Folder for the results of runs."),
+        typer.Argument(callback=expand_given, help="Folder for the results of runs."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

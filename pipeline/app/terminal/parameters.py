@@ -26,6 +26,11 @@ def expand_user(path: Path) -> Path:
         raise UsageError(f"There is no home folder for {path}.", hint="Give the full path, or set HOME.") from error
 
 
+def expand_given(path: Path | None) -> Path | None:
+    """``expand_user`` of an optional path."""
+    return None if path is None else expand_user(path)
+
+
 def presets(incomplete: str) -> list[str]:
     """Presets whose names begin with ``incomplete``, for shell completion."""
     from splatpipe.pipeline.engine.config import preset_names
