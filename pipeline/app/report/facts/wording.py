@@ -106,9 +106,9 @@ def interval(bounds: object) -> str:
     return f"{metres(bounds[0])} to {metres(bounds[1])}"
 
 
-def plural(amount: int, one: str, more: str = "") -> str:
+def plural(amount: int, one: str) -> str:
     """``1 photo``, ``2 photos``."""
-    return f"{amount:,} {one if amount == 1 else more or one + 's'}"
+    return f"{amount:,} {one if amount == 1 else one + 's'}"
 
 
 def judged_of(judged: int, held_out: int, one: str) -> str:
