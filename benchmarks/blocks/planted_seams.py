@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from block_borders import PlanLine
 from jaxtyping import Bool
 
-from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sh import C0
 

@@ -25,10 +25,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from block_borders import PlanLine
 from jaxtyping import Float64
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.raster import rasterizer
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from block_borders import Border, PlanLine, borders
 from opened_run import OpenedRun, open_run
 from planted_seams import STRIP, colour_step, doubled, gap
 from seam_detector import Seam, border_cameras, find_seams
@@ -22,14 +23,14 @@ from tables import Row, print_table
 
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.photos.pixels.dataset import load_points_and_tracks
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.survey.crs.frames import load_frame
 from splatpipe.pipeline.train.blocks.cells.cutting import cut, site, work_map
-from splatpipe.pipeline.train.blocks.cells.partition import Border, Partition
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import photo_coverages
 
 GRADES = {  # what is planted: pixels empty, pixels higher, of the colour's range
@@ -153,7 +154,7 @@ def main() -> None:
         with same_bits(arguments.threads):
             place = open_site(arguments)
             splat = place.run.model[0] if arguments.merged is None else read_splat(arguments.merged)
-            inner = place.partition.borders()
+            inner = borders(place.partition)
             rows = [row for border in inner for row in judged(place, splat, border)]
             longest = sorted(inner, key=lambda border: -border.line.length)[:PLANTED_BORDERS]
             rows += [row for border in longest if arguments.plant for row in planted(place, splat, border)]

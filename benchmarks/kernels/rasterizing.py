@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ def raster_alone(state: TrainState, plan: TrainingPlan, cameras: Sequence[Camera
     Returns:
         Median wall seconds per view, and pairs per second and core (CPU seconds of all threads, over all views).
     """
-    options = render_options(plan, plan.schedule.at(max(1, state.iteration)), False)
+    options = replace(render_options(plan, plan.schedule.at(max(1, state.iteration))), magnitudes=False)
     pairs, wall, cpu = 0, [], 0.0
     for index, camera in enumerate([*cameras[:WARMUP], *cameras]):
         generator = torch.Generator().manual_seed(index)

@@ -98,7 +98,7 @@ def costs_text(costs: Costs) -> str:
     lines = [f"{name}: {getattr(costs, name):.3g}" for name in ("pairs", "gaussians", "flat")]
     lines.append(f"keypoints: { {name: round(count) for name, count in costs.keypoints.items()} }")
     for stage, of in costs.stages.items():
-        memory, disk = next(iter(of.memory.values()), 0.0), next(iter(of.disk.values()))
+        memory, disk = next(iter(of.memory.values()), 0.0), next(iter(of.disk.values()), 0.0)
         lines.append(f"{stage}: {of.cpu:.3g}, {of.resident / 1e6:.0f}e6, {memory:.3g}, {disk:.3g}")
     return "\n".join(lines)
 

@@ -14,7 +14,6 @@ from splatpipe.demo.site.textures import Image, Painter, TextureTile
 Array = NDArray[np.float64]
 Numbers = Sequence[Any] | NDArray[Any] | float | int  # what np.asarray takes; ArrayLike is more than beartype can check
 MARGIN = 3  # texels painted beyond a face, so that bilinear lookups at its border never hit a neighbour in the atlas
-LEAF_OCTAVES = ((1.3, 0.5), (0.6, 0.55), (0.3, 0.5), (0.15, 0.3))  # wavelength in metres, strength
 FAR_TEXEL_M = 0.05  # lumps with texels of this size are far away and get no fine leaves
 ATLAS_WIDTH = 4096
 ATLAS_HEIGHT = 8192

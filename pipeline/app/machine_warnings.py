@@ -14,7 +14,6 @@ from splatpipe.pipeline.engine.machine import Mount, available_memory_bytes, mou
 from splatpipe.pipeline.engine.stage import JSON
 
 WINDOWS_KINDS = ("9p", "drvfs", "v9fs")  # Windows drives in WSL; 9p also for folders shared with other virtual machines
-NFS_KINDS = ("nfs", "nfs4")
 LOCAL_ONLY = ("nolock", "local_lock=all", "local_lock=flock", "nobrl", "localflock")  # options of NFS, SMB, Lustre
 # Folders shared by a virtual machine or container engine on Windows or macOS, and servers mounted through FUSE.
 PASSED_ON = ("virtiofs", "vboxsf", "vmhgfs", "prl_fs", "fakeowner", "osxfs", "grpcfuse", "fuse", "fuseblk")

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import cv2
 import numpy as np
 
 from splatpipe.pipeline.app.library.trained_scene import in_model_frame, scene_parts
+from splatpipe.pipeline.app.render_request import OWN_PATHS, RenderRequest
 from splatpipe.pipeline.app.terminal.console import RunConsole
 from splatpipe.pipeline.engine.errors import MachineError, UsageError
 from splatpipe.pipeline.engine.events import Event, EventReporter
-from splatpipe.pipeline.engine.files.output_file import own_folder, write_file
+from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.film.camera_path import FilmCamera, Route, cameras_along
 from splatpipe.pipeline.film.filming import (
-    MAX_SIDE,
-    MIN_SIDE,
     FilmFile,
     FrameRenderer,
     TrainedScene,
@@ -33,7 +31,6 @@ from splatpipe.pipeline.film.filming import (
 from splatpipe.pipeline.film.keyframe_file import Keyframes, read_keyframes
 from splatpipe.pipeline.film.orbit import orbit
 from splatpipe.pipeline.film.photo_route import followed_photos, photo_film
-from splatpipe.pipeline.film.video import CODECS
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.raster.device import choose_device
@@ -42,81 +39,7 @@ from splatpipe.pipeline.render.view_measures import flat_stems
 from splatpipe.pipeline.survey.crs.frames import load_frame
 
 ORBIT_STILLS = 12
-FOLDER = "renders"  # below OUT
-OWN_PATHS = ("cameras", "orbit")
 UP = np.array([0.0, 0.0, 1.0])  # in the world frame of `splat.ply`
-
-
-@dataclass(frozen=True)
-class RenderRequest:
-    """What to render.
-
-    Attributes:
-        path: ``cameras``, ``orbit``, or a file of keyframes.
-        what: ``colour``, ``depth`` or ``normals``.
-        stills: Whether to render stills instead of a film.
-        size: `1280x720`; empty for a size like that of the training images.
-        seconds: Duration of a film whose path has no times.
-        fps: Frames per second.
-        to: The film, or the folder of stills; None for one below OUT.
-    """
-
-    path: str = "cameras"
-    what: str = "colour"
-    stills: bool = False
-    size: str = ""
-    seconds: float = 10.0
-    fps: int = 25
-    to: Path | None = None
-
-    def validate(self) -> tuple[What, tuple[int, int] | None]:
-        """Validate; returns what to render, and its size in pixels or None.
-
-        Raises:
-            UsageError: if a value is invalid.
-        """
-        what: What | None = next((known for known in get_args(What) if known == self.what), None)
-        if what is None:
-            raise UsageError(
-                f'--what "{self.what[:20]}" cannot be rendered.',
-                hint=f"Choose {', '.join(get_args(What))}.",
-            )
-        if not self.size:
-            return what, None
-        match = re.fullmatch(r"([0-9]{2,4})x([0-9]{2,4})", self.size)
-        size = (int(match[1]), int(match[2])) if match else (0, 0)
-        if not all(MIN_SIDE <= side <= MAX_SIDE and (self.stills or side % 2 == 0) for side in size):
-            raise UsageError(
-                f'--size "{self.size[:20]}" is not a valid size.',
-                hint=f"Write it like 1280x720: {MIN_SIDE} to {MAX_SIDE} pixels, even ones for a film.",
-            )
-        return what, size
-
-    def target(self, out: Path) -> Path:
-        """The output path; its parent folder is created.
-
-        Raises:
-            UsageError: if it is not suitable.
-            MachineError: if the folder cannot be created.
-        """
-        stem = self.path if self.path in OWN_PATHS else flat_stems([Path(self.path).name])[0]
-        target = self.to or out / FOLDER / f"{stem}-{self.what}{'' if self.stills else '.webm'}"
-        if self.stills and target.exists() and not target.is_dir():
-            raise UsageError(f"{target} is a file.", hint="Stills are written to a folder: choose another with -o.")
-        if self.stills and target.suffix in CODECS:
-            raise UsageError(f"{target} is a film file name.", hint="Stills are written to a folder: give one with -o.")
-        if not self.stills and (target.suffix not in CODECS or target.is_dir()):
-            raise UsageError(f"{target} is not a film file.", hint=f"A film ends in {' or '.join(CODECS)}.")
-        folder = target if self.stills else target.absolute().parent
-        try:
-            if self.to is None:
-                own_folder(out, FOLDER, *([target.name] if self.stills else []))
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise MachineError(
-                f"Cannot make {folder}: {error.strerror}.", hint="Choose another path with -o."
-            ) from error
-        return target
 
 
 @dataclass(frozen=True, eq=False)

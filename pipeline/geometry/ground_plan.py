@@ -1,8 +1,7 @@
-"""Plan view in any frame: the plane normal to gravity with two axes of its own, and lines drawn on it."""
+"""Plan view in any frame: the plane normal to gravity with two axes of its own."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,40 +49,3 @@ class GroundPlan:
     def points(self, places: PlanPoints, heights: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 3"]:
         """The inverse of ``places`` and ``heights``."""
         return np.asarray(places @ self.axes + heights[:, None] * self.up)
-
-
-@dataclass(frozen=True)
-class PlanLine:
-    """A line segment in plan, which stands for the vertical plane through it.
-
-    Attributes:
-        start: Plan coordinates.
-        end: Plan coordinates, different from the start.
-    """
-
-    start: tuple[float, float]
-    end: tuple[float, float]
-
-    @property
-    def length(self) -> float:
-        """Length in plan units."""
-        return math.dist(self.start, self.end)
-
-    @property
-    def direction(self) -> Float64[np.ndarray, " 2"]:
-        """Unit vector from start to end."""
-        return (np.array(self.end) - self.start) / self.length
-
-    def along(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
-        """Distance of each place along the line: 0 at the start, its length at the end."""
-        return np.asarray((places - self.start) @ self.direction)
-
-    def beside(self, places: PlanPoints) -> Float64[np.ndarray, " n"]:
-        """Perpendicular distance of each place from the line, positive on its left."""
-        x, y = self.direction
-        return np.asarray((places - self.start) @ np.array([-y, x]))
-
-    def place(self, along: float, beside: float = 0.0) -> Float64[np.ndarray, " 2"]:
-        """The inverse of ``along`` and ``beside``."""
-        x, y = self.direction
-        return np.asarray(self.start + along * np.array([x, y]) + beside * np.array([-y, x]))

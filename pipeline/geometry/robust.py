@@ -1,12 +1,16 @@
-"""Weights of robust fits: how much a residual counts, so that outliers count little.
+"""Robust fits: weights by which outliers count little, and the similarity that repeated fits with them lead to.
 
 P. J. Huber, "Robust Statistics" (1981).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float64
+
+from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
 
 CAUCHY = 2.385  # spreads at which a Cauchy weight is 1/2: 95 % efficiency on Gaussian noise
 MAD_TO_SIGMA = 1.4826  # standard deviation of Gaussian noise over its median absolute deviation
@@ -46,3 +50,29 @@ def absolute_weights(lengths: Float64[np.ndarray, " n"], floor: float | None = N
     """
     least = FLOOR_MEDIANS * max(float(np.median(lengths)), _LEAST) if floor is None else floor
     return np.asarray(1.0 / np.maximum(lengths, least))
+
+
+def robust_similarity(
+    source: Float64[np.ndarray, "n 3"],
+    target: Float64[np.ndarray, "n 3"],
+    weigh: Callable[[Float64[np.ndarray, " n"]], Float64[np.ndarray, " n"]],
+    rounds: int,
+) -> tuple[Similarity, Float64[np.ndarray, "n 3"]]:
+    """Fit a similarity by least squares again and again, each time with weights by the distances that it left.
+
+    Args:
+        source: Points in one frame.
+        target: The same points in the other.
+        weigh: The weights by the distances.
+        rounds: How often.
+
+    Returns:
+        The similarity, and what it leaves of the sources at the targets.
+    """
+    weights = np.ones(len(source))
+    for _ in range(rounds):
+        scale, rotation, translation = fit_similarity(source, target, weights)
+        similarity = Similarity(float(scale), rotation, translation)
+        residuals = similarity.apply(source) - target
+        weights = weigh(np.linalg.norm(residuals, axis=1))
+    return similarity, residuals

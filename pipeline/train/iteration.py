@@ -52,8 +52,7 @@ def optimise_step(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, n
     """
     techniques = state.techniques
     # Render.
-    magnitudes = now.is_observed and state.density.magnitudes
-    settings = techniques.settings(render_options(plan, now, magnitudes), state.gaussians, photo.camera, now)
+    settings = techniques.settings(render_options(plan, now), state.gaussians, photo.camera, now)
     probe = state.screen_probe() if now.is_observed else None
     model = techniques.before_render(state.drawn, now)
     rendered = rasterizer.render(model, photo.camera, settings, means2d_probe=probe, buffers=state.buffers)
@@ -77,15 +76,15 @@ def optimise_step(state: TrainState, plan: TrainingPlan, photo: TrainingPhoto, n
     state.history.add_loss(photometric.detach())
 
 
-def render_options(plan: TrainingPlan, now: ScheduleStep, magnitudes: bool) -> rasterizer.RenderOptions:
-    """The render options of an iteration; ``magnitudes`` also sums the screen gradient's magnitudes."""
+def render_options(plan: TrainingPlan, now: ScheduleStep) -> rasterizer.RenderOptions:
+    """The render options of an iteration, before the techniques'."""
     return rasterizer.RenderOptions(
         sh_degree=now.sh_degree,
         background=now.background,
         antialias=plan.options.antialias,
         near=plan.near,
         depth=False,
-        magnitudes=magnitudes,
+        magnitudes=now.is_observed and plan.options.density == "absolute",
     )
 
 

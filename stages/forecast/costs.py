@@ -82,18 +82,16 @@ FORMAT_COSTS: Mapping[str, tuple[float, float]] = MappingProxyType(
         "model": (0.04, 248.0),
         "sog": (6.3, 31.0),
         "glb": (0.1, 240.0),
-        "tiles": (0.29, 46.0),
-        "streamed-sog": (12.0, 66.0),
-        "web": (0.34, 46.0),
+        "tiles": (2.1, 46.0),
+        "streamed-sog": (13.8, 66.0),
+        "web": (2.1, 46.0),
         "laz": (0.1, 12.0),
     }
 )
 """CPU time of each of `export.formats`, over that of an export without any, and its bytes per Gaussian.
 
-From 59,000 and 103,000 Gaussians of SH degree 3 (brighton, demo); per Gaussian, SOG of a million takes half."""
-LEVELS_WORK = 1.8
-"""CPU time of the levels of detail, likewise, which are made once for all streamed formats."""
-IN_LEVELS = frozenset({"tiles", "streamed-sog", "web"})
+From 59,000 and 103,000 Gaussians of SH degree 3 (brighton, demo); per Gaussian, SOG of a million takes half. Those of
+several levels include 1.8 for the levels, which are made once for all of them."""
 WITH_PHOTOS = frozenset({"colmap", "transforms"})
 """Formats that include a folder of the undistorted photos, which they share."""
 
@@ -101,11 +99,11 @@ MAPPED = {"root_photos": 347e6, "retried_at_once": 250e6}  # an upper bound: unp
 EXPORTED = {"gaussians": 375, "format_bytes": 1, "exported_dataset": 0.598e6}
 STAGES = {
     "ingest": StageCosts(0.013, {"pixels": 1}, 0.8, 181e6, {}, {"photos": 508}),
-    "control": StageCosts(0.1, {"control": 1}, 0.0, 180e6, {}, {"control": 1200}),
+    "control": StageCosts(0.1, {}, 0.0, 180e6, {}, {}),
     "features": StageCosts(0.287, {"searched": 1}, 0.98, 157e6, {"searched_at_once": 266e6}, {"keypoints": 156}),
     "matches": StageCosts(1.36e-5, {"compared": 1}, 0.97, 250e6, {"threads": 185e6}, {"keypoints": 30.1}),
     "sparse": StageCosts(0.548, {"photos": 1, "crowd": 0.75, "doubt": 1}, 0.2, 215e6, MAPPED, {"keypoints": 31.4}),
-    "targets": StageCosts(0.21, {"control_pixels": 1}, 0.0, 230e6, {"tiles_at_once": 100e6}, {"control_photos": 1300}),
+    "targets": StageCosts(0.21, {"control_pixels": 1}, 0.0, 230e6, {"tiles_at_once": 100e6}, {}),
     "georef": StageCosts(0.019, {"photos": 1}, 0.0, 157e6, {"keypoints": 724}, {"keypoints": 30.4}),
     "undistort": StageCosts(0.0363, {"pixels": 1}, 0.8, 241e6, {"pixels_at_once": 18.2e6}, {"dataset": 0.598e6}),
     "split": StageCosts(0.0001, {"photos": 1}, 0.0, 264e6, {}, {"photos": 18.3}),

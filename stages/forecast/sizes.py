@@ -9,13 +9,13 @@ from splatpipe.pipeline.film.options import MAX_FILM_MEGAPIXELS
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S
 from splatpipe.pipeline.web.options import parse_formats
-from splatpipe.stages.forecast.costs import FORMAT_COSTS, IN_LEVELS, LEVELS_WORK, WITH_PHOTOS, Costs, Sizes
+from splatpipe.stages.forecast.costs import FORMAT_COSTS, WITH_PHOTOS, Costs, Sizes
 from splatpipe.stages.forecast.training import MEGA, CaptureSize, Training
 from splatpipe.stages.options import LineConfig
 
 SIFT_WORK = {"opencv-sift": 1.0, "sift": 3.2}  # CPU seconds per pixel relative to OpenCV's: 2.4 on sceaux, 4.3 on demo
 SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # memory per thread relative to OpenCV's
-MAX_KEYPOINTS = {"opencv-sift": 1.25, "sift": 1.3}  # times max_features: several orientations, whole scales
+MAX_KEYPOINTS = 1.3  # times max_features: several orientations, whole scales
 NEIGHBOURS = 20  # per photo, behind `Costs.pairs`
 PHOTOS_OF_ONE_COST = 50  # up to this many photos, mapping costs the constant per photo; with more photos it costs more
 WITHOUT_POSITIONS = 2.5  # times the mapping cost: pairs that only look alike, doubts, second mappings
@@ -30,12 +30,10 @@ def sizes_of(size: CaptureSize, config: LineConfig, threads: int, costs: Costs, 
     """
     photos, dataset, extractor = float(size.photos), training.size.megapixels, config.features.extractor
     searched = min(size.megapixels, size.shape * config.features.max_image_size**2 / MEGA)
-    most_keypoints = MAX_KEYPOINTS[extractor] * config.features.max_features
-    photo_keypoints = min(most_keypoints, costs.keypoints[extractor] * searched)
+    photo_keypoints = min(MAX_KEYPOINTS * config.features.max_features, costs.keypoints[extractor] * searched)
     pairs = _pairs(size, config, costs.pairs)
     formats = set(parse_formats(config.export.formats))
     each = [FORMAT_COSTS[name] for name in formats & set(FORMAT_COSTS)]
-    levels = LEVELS_WORK if IN_LEVELS & formats else 0.0
     return {
         "threads": float(threads),
         "photos": photos,
@@ -50,8 +48,6 @@ def sizes_of(size: CaptureSize, config: LineConfig, threads: int, costs: Costs, 
         "compared": pairs * photo_keypoints,
         "doubt": 1.0 if size.positions else WITHOUT_POSITIONS,
         "retried_at_once": max(1, threads // 2) * min(size.megapixels, RETRIED_MEGAPIXELS),
-        "control": float(size.control),
-        "control_photos": size.control * photos,
         "control_pixels": size.control * photos * size.megapixels,
         "tiles_at_once": size.control * threads * min(size.megapixels, TARGETS_TILE),
         "dataset": photos * dataset,  # pixels
@@ -61,7 +57,7 @@ def sizes_of(size: CaptureSize, config: LineConfig, threads: int, costs: Costs, 
         "judged": _judged_photos(size, config) * min(dataset, JUDGED_MEGAPIXELS),  # pixels
         "filmed": _film_megapixels(config, training.megapixels),
         "depths": photos * min(dataset, config.depths.max_megapixels),  # pixels
-        "exported": training.gaussians * (1.0 + sum(work for work, _bytes in each) + levels),
+        "exported": training.gaussians * (1.0 + sum(work for work, _bytes in each)),
         "format_bytes": training.gaussians * sum(size for _work, size in each),
         "exported_dataset": photos * dataset if WITH_PHOTOS & formats else 0.0,
     }

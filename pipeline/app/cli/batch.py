@@ -29,27 +29,11 @@ if TYPE_CHECKING:
 
 RETRIES = 2  # a training that ran out of memory twice gets three times as much on the last try
 
-CapturesArgument = Annotated[
-    Path, typer.Argument(help="Folder of capture folders, or a list of captures: TOML or CSV.", show_default=False)
-]
-ProfileOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FOLDER", help="Snakemake profile, to run the jobs elsewhere: Slurm, Kubernetes."),
-]
-RetriesOption = Annotated[int, typer.Option(min=0, max=10, help="How many times a stage that crashed is restarted.")]
-RetryFailedOption = Annotated[
-    bool,
-    typer.Option(
-        "--retry-failed", help="Retry captures that failed because of their photos or options, even if unchanged."
-    ),
-]
-DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="List what would run for each capture, and count the jobs.")
-]
-
 
 def batch(
-    captures: CapturesArgument,
+    captures: Annotated[
+        Path, typer.Argument(help="Folder of capture folders, or a list of captures: TOML or CSV.", show_default=False)
+    ],
     out: OutArgument,
     preset: PresetOption = "standard",
     config: ConfigOption = None,
@@ -57,11 +41,23 @@ def batch(
     until: UntilOption = None,
     *,
     machine: MachineOptions,
-    profile: ProfileOption = None,
-    retries: RetriesOption = RETRIES,
-    retry_failed: RetryFailedOption = False,
+    profile: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Snakemake profile, to run the jobs elsewhere: Slurm, Kubernetes."),
+    ] = None,
+    retries: Annotated[
+        int, typer.Option(min=0, max=10, help="How many times a stage that crashed is restarted.")
+    ] = RETRIES,
+    retry_failed: Annotated[
+        bool,
+        typer.Option(
+            "--retry-failed", help="Retry captures that failed because of their photos or options, even if unchanged."
+        ),
+    ] = False,
     notify: NotifyOption = None,
-    dry_run: DryRunOption = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List what would run for each capture, and count the jobs.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run many captures unattended: finished results are reused, and a failed capture does not stop the others."""
@@ -75,8 +71,8 @@ def batch(
     code = 0
     try:
         load_preset(preset)
-        for name in filter(None, (until,)):
-            check_stage(name)
+        if until:
+            check_stage(until)
         if notify is not None:
             check_command(notify)
         where = open_profile(profile)

@@ -26,16 +26,14 @@ PAGE = "check.html"
 PRESETS = ("preview", "standard", "high")
 SIGNS = {"error": "✗", "warning": "!", "note": "·"}
 
-PageOption = Annotated[
-    Path, typer.Option("--output", "-o", help="The page to write. Default: check.html in the current folder.")
-]
-
 
 def check(
     photos: PhotosArgument,
     config: ConfigOption = None,
     assignments: SetOption = None,
-    page: PageOption = Path(PAGE),
+    page: Annotated[
+        Path, typer.Option("--output", "-o", help="The page to write. Default: check.html in the current folder.")
+    ] = Path(PAGE),
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:

@@ -32,20 +32,6 @@ def _repeated(metavar: str, help_text: str, panel: str) -> Any:
     return typer.Option(metavar=metavar, help=help_text, rich_help_panel=panel)
 
 
-SourceArgument = Annotated[
-    Path, typer.Argument(metavar="IN", callback=expand_user, help="A splat of any format, or the OUT of a run.")
-]
-TargetArgument = Annotated[
-    Path, typer.Argument(metavar="OUT", callback=expand_user, help="The new file; its extension sets the format.")
-]
-LocalOption = Annotated[
-    bool, typer.Option("--local", help="Coordinates are in metres from the splat's origin, not in its CRS.")
-]
-PicturesOption = Annotated[
-    bool, typer.Option("--pictures/--no-pictures", help="Write pictures of the splat before and after.")
-]
-
-
 @dataclass(frozen=True)
 class StepOptions:
     """The steps of an edit."""
@@ -106,13 +92,21 @@ class StepOptions:
 
 def edit(
     context: typer.Context,
-    source: SourceArgument,
-    out: TargetArgument,
+    source: Annotated[
+        Path, typer.Argument(metavar="IN", callback=expand_user, help="A splat of any format, or the OUT of a run.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", callback=expand_user, help="The new file; its extension sets the format.")
+    ],
     *,
     steps: StepOptions,
-    local: LocalOption = False,
+    local: Annotated[
+        bool, typer.Option("--local", help="Coordinates are in metres from the splat's origin, not in its CRS.")
+    ] = False,
     format_name: FormatOption = None,
-    pictures: PicturesOption = True,
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Write pictures of the splat before and after.")
+    ] = True,
     threads: ThreadsOption = 0,
     as_json: JsonOption = False,
 ) -> None:

@@ -21,24 +21,15 @@ from splatpipe.pipeline.app.terminal.parameters import (
 from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
-FormatsOption = Annotated[
-    str,
-    typer.Option(
-        "--format", "-f", metavar="NAMES", help="Formats to make, separated by commas; existing ones are kept."
-    ),
-]
-SplatArgument = Annotated[
-    Path,
-    typer.Argument(metavar="IN", callback=expand_user, help="PLY, SPZ, SOG or GLB, or a trainer's model folder."),
-]
-TargetArgument = Annotated[
-    Path, typer.Argument(metavar="OUT", callback=expand_user, help="Its extension sets the format.")
-]
-
 
 def export(
     out: OutArgument,
-    formats: FormatsOption,
+    formats: Annotated[
+        str,
+        typer.Option(
+            "--format", "-f", metavar="NAMES", help="Formats to make, separated by commas; existing ones are kept."
+        ),
+    ],
     assignments: SetOption = None,
     *,
     machine: MachineOptions,
@@ -47,8 +38,7 @@ def export(
     """Export a finished run in more formats, to OUT/export; docs/formats.md lists which programs read them."""
     from splatpipe.pipeline.app.formats import check_possible, with_formats
 
-    with CommandSummary(out, session.as_json) as done:
-        done.notify_by(session.notify)
+    with session.summary(out) as done:
         tables = [with_formats(out, formats), *overrides(None, assignments, None).tables]
         check_possible(out, formats)
         request = existing_request(out, tables, machine.device, machine.threads)
@@ -56,8 +46,11 @@ def export(
 
 
 def convert(
-    source: SplatArgument,
-    target: TargetArgument,
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="IN", callback=expand_user, help="PLY, SPZ, SOG or GLB, or a trainer's model folder."),
+    ],
+    target: Annotated[Path, typer.Argument(metavar="OUT", callback=expand_user, help="Its extension sets the format.")],
     format_name: FormatOption = None,
     as_json: JsonOption = False,
 ) -> None:

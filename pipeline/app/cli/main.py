@@ -25,35 +25,24 @@ from splatpipe.pipeline.app.library.requests import (
     request_of,
     stages_to_rerun,
 )
+from splatpipe.pipeline.app.render_request import RenderRequest
 from splatpipe.pipeline.app.terminal.parameters import (
-    BoundaryOption,
+    CaptureSettings,
     ConfigOption,
-    FpsOption,
     JsonOption,
+    LineSettings,
     MachineOptions,
-    MaxMemoryOption,
     OutArgument,
-    PathOption,
     PhotosArgument,
     PresetOption,
-    RerunFromOption,
-    RerunOption,
-    SecondsOption,
     SeedOption,
     SessionOptions,
     SetOption,
-    ShardOption,
-    SizeOption,
-    StillsOption,
-    TargetOption,
-    TimeBudgetOption,
     UntilOption,
-    WhatOption,
-    expand_user,
+    expand_given,
     stages,
 )
-from splatpipe.pipeline.app.terminal.runs import status_as_json, with_boundary, with_budgets
-from splatpipe.pipeline.app.terminal.summary import CommandSummary, for_the_user, print_json
+from splatpipe.pipeline.app.terminal.summary import CommandSummary, for_the_user, print_json, status_as_json
 from splatpipe.pipeline.engine.errors import (
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
@@ -103,14 +92,16 @@ def run(
     out: OutArgument,
     preset: PresetOption = "standard",
     config: ConfigOption = None,
-    assignments: SetOption = None,
-    time_budget: TimeBudgetOption = None,
-    max_memory: MaxMemoryOption = None,
-    boundary: BoundaryOption = None,
-    until: UntilOption = None,
-    rerun: RerunOption = None,
-    rerun_from: RerunFromOption = None,
     *,
+    settings: CaptureSettings,
+    until: UntilOption = None,
+    rerun: Annotated[
+        list[str] | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage again. Repeatable.")
+    ] = None,
+    rerun_from: Annotated[
+        str | None,
+        typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage and all later ones again."),
+    ] = None,
     machine: MachineOptions,
     seed: SeedOption = None,
     session: SessionOptions,
@@ -118,11 +109,8 @@ def run(
     """Turn a folder of photos into a Gaussian splat; valid results of earlier runs are reused."""
     from splatpipe.pipeline.engine.config import load_preset
 
-    with CommandSummary(out, session.as_json) as done:
-        done.notify_by(session.notify)
-        assignments = with_budgets(assignments, time_budget, max_memory)
-        assignments = with_boundary(assignments, boundary)
-        resolved = overrides(config, assignments, seed).resolve(load_preset(preset))
+    with session.summary(out) as done:
+        resolved = overrides(config, settings.assignments(), seed).resolve(load_preset(preset))
         again = stages_to_rerun(rerun or [], rerun_from, until)
         request = request_of(photos, out, resolved, machine.device, machine.threads)
         run_line(request, done.watch, until=until, rerun=again, wait=session.wait)
@@ -132,10 +120,8 @@ def run(
 def demo(
     out: OutArgument,
     preset: PresetOption = "demo",
-    assignments: SetOption = None,
-    time_budget: TimeBudgetOption = None,
-    max_memory: MaxMemoryOption = None,
     *,
+    settings: LineSettings,
     machine: MachineOptions,
     seed: SeedOption = None,
     session: SessionOptions,
@@ -143,8 +129,8 @@ def demo(
     """Run the pipeline on the demo capture that ships with splatpipe."""
     from splatpipe.demo import capture_path
 
-    given = (capture_path(), out, preset, None, assignments, time_budget, max_memory)
-    run(*given, machine=machine, seed=seed, session=session)
+    given = CaptureSettings(**vars(settings))
+    run(capture_path(), out, preset, settings=given, machine=machine, seed=seed, session=session)
 
 
 @with_help(app)
@@ -152,14 +138,16 @@ def stage(
     name: Annotated[str, typer.Argument(metavar="NAME", autocompletion=stages, help="The stage to run.")],
     out: OutArgument,
     assignments: SetOption = None,
-    shard: ShardOption = None,
+    shard: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="K", help="Run only this shard; other processes may run others at the same time."),
+    ] = None,
     *,
     machine: MachineOptions,
     session: SessionOptions,
 ) -> None:
     """Run one stage of an existing OUT again, or one of its shards; no other stage except the one that divides it."""
-    with CommandSummary(out, session.as_json) as done:
-        done.notify_by(session.notify)
+    with session.summary(out) as done:
         check_stage(name)
         if shard is not None and assignments:
             raise UsageError("All shards of a stage have the same options.", hint="Omit either --set or --shard.")
@@ -180,8 +168,7 @@ def georef(
     session: SessionOptions,
 ) -> None:
     """Georeference a finished run again, with other control points or another CRS. Unaffected results are reused."""
-    with CommandSummary(out, session.as_json) as done:
-        done.notify_by(session.notify)
+    with session.summary(out) as done:
         control = [] if gcp is None else [{"georef": {"control": gcp}}]
         tables = [*control, *overrides(None, assignments, None).tables]
         request = existing_request(out, tables, machine.device, machine.threads)
@@ -242,8 +229,7 @@ def surface(
     from splatpipe.pipeline.engine.quantities import parse_length
     from splatpipe.stages.products import options_for
 
-    with CommandSummary(out, session.as_json) as done:
-        done.notify_by(session.notify)
+    with session.summary(out) as done:
         wanted = MeasurementRequest.of(section or [], volume, base, model)
         products = wanted.products if products is None and wanted.anything else products
         products_table = options_for(products, None if gsd is None else parse_length(gsd, "--gsd"), source)
@@ -265,24 +251,11 @@ with_help(app)(convert)
 
 
 @with_help(app)
-def render(
-    out: OutArgument,
-    path: PathOption = "cameras",
-    what: WhatOption = "colour",
-    stills: StillsOption = False,
-    size: SizeOption = "",
-    seconds: SecondsOption = 10.0,
-    fps: FpsOption = 25,
-    target: TargetOption = None,
-    *,
-    machine: MachineOptions,
-    as_json: JsonOption = False,
-) -> None:
+def render(out: OutArgument, *, wanted: RenderRequest, machine: MachineOptions, as_json: JsonOption = False) -> None:
     """Render a film or stills of a finished run: along its cameras, in an orbit, or from a keyframe file."""
     with CommandSummary(out, as_json) as done:
-        from splatpipe.pipeline.app.renders import RenderRequest, render_run
+        from splatpipe.pipeline.app.renders import render_run
 
-        wanted = RenderRequest(path, what, stills, size, seconds, fps, target)
         done.details = {"render": render_run(out, wanted, machine.threads or available_cores(), machine.device)}
 
 
@@ -383,7 +356,7 @@ def options(preset: PresetOption = "standard") -> None:
 def doctor(
     out: Annotated[
         Path | None,
-        typer.Argument(callback=lambda path: path and expand_user(path), help="Folder for the results of runs."),
+        typer.Argument(callback=expand_given, help="Folder for the results of runs."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

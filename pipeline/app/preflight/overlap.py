@@ -31,7 +31,6 @@ NEIGHBOURS = 8  # partners per photo by position or sequence; a run uses 20
 SIMILAR_PARTNERS = 4  # further partners by appearance, since positions may be wrong
 RETRY_PARTNERS = 16  # partners tried for photos without a match
 MIN_MEDIAN_PARTNERS = 2.5  # least median number of matched photos: with fewer, a run loses photos
-MIN_CONNECTED_SHARE = 0.9  # least share of the photos in the largest component; else the capture is fragmented
 MIN_CONNECTED = 0.2  # least share for a reconstruction
 OUTLINE_SHARE = 0.35  # half the width of a gap's outline as a share of its length
 

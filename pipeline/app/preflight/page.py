@@ -6,7 +6,6 @@ import importlib.metadata
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +14,7 @@ from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.app.preflight.finding_pictures import FindingPicture, finding_pictures
 from splatpipe.pipeline.app.preflight.findings import RANK, Finding, Preflight, PresetForecast, Severity
 from splatpipe.pipeline.app.preflight.overlap_map import overlap_map
-from splatpipe.pipeline.app.report.facts.wording import count, duration, number, plural, roughly, size
+from splatpipe.pipeline.app.report.facts.wording import count, duration, local_moment, number, plural, roughly, size
 from splatpipe.pipeline.engine.files.durable import write_durably
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
@@ -77,7 +76,7 @@ def check_page(preflight: Preflight) -> str:
         style="check.css",
         name=preflight.folder.resolve().name or "photos",
         version=importlib.metadata.version("splatpipe"),
-        made=_moment(preflight.when_s),
+        made=local_moment(preflight.when_s),
         took=duration(preflight.seconds),
         level=level,
         headline=headline,
@@ -171,11 +170,3 @@ def _span(times: list[str]) -> str:
     if first == last:
         return first
     return f"{first} to {last[11:] if first[:10] == last[:10] else last}"
-
-
-def _moment(seconds: float) -> str:
-    """A point in time in this machine's time zone, with the zone."""
-    try:
-        return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
-    except (OverflowError, OSError, ValueError):
-        return "at an unknown time"

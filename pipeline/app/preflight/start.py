@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 if TYPE_CHECKING:
     from splatpipe.pipeline.engine.runs.session import Request
     from splatpipe.pipeline.train.blocks.cells.division import Division
-    from splatpipe.stages.forecast.training import Training
+    from splatpipe.stages.forecast.training import CaptureSize, Training
     from splatpipe.stages.options import LineConfig
 
 
@@ -89,17 +89,13 @@ def _will_train(request: Request, until: str | None) -> bool:
 
 def forecast_text(request: Request) -> str:
     """The forecast for the whole pipeline on this machine, in a sentence; empty if the capture's size is unknown."""
-    from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.app.report.facts.wording import roughly
     from splatpipe.pipeline.engine.machine import available_memory_bytes
     from splatpipe.pipeline.engine.runs.needs import whole
-    from splatpipe.pipeline.engine.runs.source import open_source
     from splatpipe.stages.forecast.needs import RunForecast, machine_speed
 
-    config, threads = cast("LineConfig", request.config), request.machine.threads
-    source = open_source(request.photos, request.out, request.stages, config)
-    size = size_of(source)
-    if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or _on_cuda(request.machine.device):
+    config, threads, size = cast("LineConfig", request.config), request.machine.threads, _size(request)
+    if size is None or _on_cuda(request.machine.device):
         return ""
     run = RunForecast.of(size, config, threads, available_memory_bytes())
     training, needs = run.training, run.needs(machine_speed())
@@ -128,17 +124,13 @@ def shortage_text(request: Request, until: str | None = None) -> str:
         request: The run. Its training keeps to the limit in any case.
         until: The last stage; None for the whole pipeline.
     """
-    from splatpipe.pipeline.app.preflight.sizing import size_of
     from splatpipe.pipeline.engine.machine import memory_limit_bytes
-    from splatpipe.pipeline.engine.runs.source import open_source
     from splatpipe.stages.forecast.needs import TRAINING, RunForecast
 
-    limit, config = memory_limit_bytes(request.machine.memory_bytes), cast("LineConfig", request.config)
-    source = open_source(request.photos, request.out, request.stages, config)
-    size = size_of(source)
-    if source.model is not None or size.photos == 0 or size.megapixels == 0.0 or not limit:
+    limit, size = memory_limit_bytes(request.machine.memory_bytes), _size(request)
+    if size is None or not limit:
         return ""
-    needs = RunForecast.of(size, config, 1, limit).needs(1.0)
+    needs = RunForecast.of(size, cast("LineConfig", request.config), 1, limit).needs(1.0)
     names = [stage.name for stage in request.stages]
     names = names[: names.index(until) + 1] if until in names else names
     short = [name for name in names if name not in TRAINING and name in needs and needs[name].memory_bytes > limit]
@@ -147,6 +139,16 @@ def shortage_text(request: Request, until: str | None = None) -> str:
     most = [f"{name} up to {needs[name].memory_bytes / 1e9:.1f} GB" for name in short]
     text = f"Memory may not suffice: {', '.join(most)} by the forecast, and the limit is {limit / 1e9:.1f} GB"
     return f"{text}; raise it (--max-memory, the container's limit), or give fewer or smaller photos."
+
+
+def _size(request: Request) -> CaptureSize | None:
+    """The capture's size; None if it is unknown, or the photos come with a model, whose mapping has no forecast."""
+    from splatpipe.pipeline.app.preflight.sizing import size_of
+    from splatpipe.pipeline.engine.runs.source import open_source
+
+    source = open_source(request.photos, request.out, request.stages, request.config)
+    size = size_of(source)
+    return None if source.model is not None or size.photos * size.megapixels == 0.0 else size
 
 
 def blocks_text(training: Training, division: Division) -> str:

@@ -25,6 +25,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from splatpipe.pipeline.app.report.facts.wording import duration
 from splatpipe.pipeline.app.report.verdict import CAMERAS, Verdict
 from splatpipe.pipeline.app.terminal.sentences import sentence
 from splatpipe.pipeline.engine.errors import SplatpipeError
@@ -149,7 +150,7 @@ class RunConsole:
         elif not self._console.is_terminal and now_s - self._plain_printed_s > PLAIN_INTERVAL_S:
             self._plain_printed_s = now_s
             left_s = self._step.left_s(now_s, done, total)
-            left = "" if left_s is None else f", about {_duration(left_s)} left"
+            left = "" if left_s is None else f", about {duration(left_s)} left"
             self._console.print(
                 f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}{left}{of_all}", markup=False
             )
@@ -157,7 +158,7 @@ class RunConsole:
     def _stage_finished(self, stage: str, data: Mapping[str, JSON]) -> None:
         self.close()
         self._shards.end(stage, float(data["seconds"]))
-        self._line("✓", "green", stage, f"{_duration(data['seconds'])}  {sentence(stage, data['summary'])}")
+        self._line("✓", "green", stage, f"{duration(data['seconds'])}  {sentence(stage, data['summary'])}")
 
     def _stage_reused(self, stage: str, data: Mapping[str, JSON]) -> None:
         self._shards.end(stage, float(data["seconds"]))
@@ -223,7 +224,7 @@ class ShardTimes:
         whole = seconds * total / done
         each = [*self._took.get(self._stage, {}).values(), whole]
         left = whole - seconds + self._after * sum(each) / len(each)
-        return f", {_duration(left)} including the {self._after} remaining"
+        return f", {duration(left)} including the {self._after} remaining"
 
 
 def escape(text: str) -> str:
@@ -247,7 +248,7 @@ def show_status(statuses: Iterable[StageStatus]) -> None:
     for status in statuses:
         for row in (status, *status.shards):
             artifact = row.artifact
-            took = _duration(float(artifact.manifest["seconds"])) if artifact else ""
+            took = duration(float(artifact.manifest["seconds"])) if artifact else ""
             what = sentence(row.stage.name, artifact.summary) if artifact else row.reason
             name = row.stage.name if row is status else f"  {row.stage.name}"
             table.add_row(name, f"[{COLOURS[row.state]}]{row.state}[/]", took, Text(what), end_section=False)
@@ -276,7 +277,7 @@ def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], result
         result_lines: Measurement results, one line each.
     """
     console = Console(file=sys.stderr, highlight=False)
-    done = "All results are up to date: nothing to do." if seconds is None else f"Done in {_duration(seconds)}."
+    done = "All results are up to date: nothing to do." if seconds is None else f"Done in {duration(seconds)}."
     console.print(f"\n[bold]{done}[/]", soft_wrap=True)
     sizes: dict[Path, int] = {}
     for path in files:  # files in a folder are shown as the folder
@@ -394,13 +395,6 @@ def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
 def print_line(text: str) -> None:
     """Print one line for the user on stderr."""
     Console(file=sys.stderr, highlight=False).print(escape(text), soft_wrap=True)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 def _bytes(size: float) -> str:

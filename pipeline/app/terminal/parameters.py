@@ -1,13 +1,16 @@
-"""Arguments and options shared by the commands."""
+"""Arguments and options of several commands, alone and in groups; a command declares its own in its signature."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from splatpipe.pipeline.app.terminal.summary import CommandSummary
 from splatpipe.pipeline.engine.errors import UsageError
 
 
@@ -21,6 +24,11 @@ def expand_user(path: Path) -> Path:
         return path.expanduser()
     except RuntimeError as error:
         raise UsageError(f"There is no home folder for {path}.", hint="Give the full path, or set HOME.") from error
+
+
+def expand_given(path: Path | None) -> Path | None:
+    """``expand_user`` of an optional path."""
+    return None if path is None else expand_user(path)
 
 
 def presets(incomplete: str) -> list[str]:
@@ -61,10 +69,6 @@ SetOption = Annotated[
         "--set", metavar="SECTION.OPTION=VALUE", help="Set one option; overrides the preset and --config. Repeatable."
     ),
 ]
-ShardOption = Annotated[
-    int | None,
-    typer.Option(min=1, metavar="K", help="Run only this shard; other processes may run others at the same time."),
-]
 ThreadsOption = Annotated[
     int, typer.Option(min=0, max=1024, help="Threads; 0 for all cores. Does not change the result.")
 ]
@@ -79,54 +83,7 @@ NotifyOption = Annotated[
     ),
 ]
 PresetOption = Annotated[str, typer.Option(autocompletion=presets, help="preview (minutes), standard or high.")]
-TimeBudgetOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="10m|90s|1h30m",
-        help="Time for the whole command; training is planned to use what the other stages leave.",
-    ),
-]
-MaxMemoryOption = Annotated[
-    str | None, typer.Option(metavar="8G|512M", help="Memory limit of training; 1G is 10⁹ bytes.")
-]
-BoundaryOption = Annotated[
-    str | None,
-    typer.Option(metavar="FILE", help="Area of interest (GeoJSON); everything outside stays coarse. auto, or none."),
-]
 UntilOption = Annotated[str | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Stop after this stage.")]
-RerunOption = Annotated[
-    list[str] | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage again. Repeatable.")
-]
-RerunFromOption = Annotated[
-    str | None, typer.Option(metavar="STAGE", autocompletion=stages, help="Run this stage and all later ones again.")
-]
-PathOption = Annotated[
-    str,
-    typer.Option(
-        metavar="cameras|orbit|FILE", help="Camera path: along the cameras, an orbit, or a keyframe file (JSON, CSV)."
-    ),
-]
-WhatOption = Annotated[str, typer.Option(metavar="colour|depth|normals", help="What to render.")]
-StillsOption = Annotated[
-    bool,
-    typer.Option(
-        "--stills", help="Pictures instead of a film: one for each photo, 12 of an orbit, or one for each keyframe."
-    ),
-]
-SizeOption = Annotated[
-    str, typer.Option(metavar="WxH", help="In pixels. Default: 16:9, with as many pixels as the training photos.")
-]
-SecondsOption = Annotated[float, typer.Option(min=0.1, max=600.0, help="Length of the film, if the path has no times.")]
-FpsOption = Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")]
-TargetOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--output",
-        "-o",
-        callback=lambda path: path and expand_user(path),
-        help="Film file (.webm, or .mp4, four times slower) or folder of stills. Default: in OUT/renders.",
-    ),
-]
 FormatOption = Annotated[
     str | None,
     typer.Option("--format", "-f", metavar="NAME", help="Format, if OUT's extension does not set it: spz2, model."),
@@ -150,3 +107,58 @@ class SessionOptions:
     ] = False
     notify: NotifyOption = None
     as_json: JsonOption = False
+
+    @contextmanager
+    def summary(self, out: Path) -> Iterator[CommandSummary]:
+        """The summary of a command that works in OUT; the user's own command is called at its end."""
+        with CommandSummary(out, self.as_json) as done:
+            done.notify_by(self.notify)
+            yield done
+
+
+@dataclass(frozen=True)
+class LineSettings:
+    """Options of the line by name, and those that have an abbreviation."""
+
+    by_name: SetOption = None
+    time_budget: Annotated[
+        str | None,
+        typer.Option(
+            metavar="10m|90s|1h30m",
+            help="Time for the whole command; training is planned to use what the other stages leave.",
+        ),
+    ] = None
+    max_memory: Annotated[
+        str | None, typer.Option(metavar="8G|512M", help="Memory limit of training; 1G is 10⁹ bytes.")
+    ] = None
+
+    def assignments(self) -> list[str]:
+        """All as assignments; those by name come last and take precedence.
+
+        Raises:
+            UsageError: if a budget cannot be read.
+        """
+        from splatpipe.pipeline.engine.quantities import parse_bytes, parse_duration
+
+        budgets = []
+        if self.time_budget is not None:
+            budgets.append(f"train.time_budget_s={parse_duration(self.time_budget, '--time-budget')!r}")
+        if self.max_memory is not None:
+            budgets.append(f"train.max_memory_bytes={parse_bytes(self.max_memory, '--max-memory')}")
+        return [*budgets, *(self.by_name or ())]
+
+
+@dataclass(frozen=True)
+class CaptureSettings(LineSettings):
+    """The same for a user's own photos."""
+
+    boundary: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE", help="Area of interest (GeoJSON); everything outside stays coarse. auto, or none."
+        ),
+    ] = None
+
+    def assignments(self) -> list[str]:
+        """As of ``LineSettings``."""
+        return [*([] if self.boundary is None else [f"georef.boundary={self.boundary}"]), *super().assignments()]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.verdict import Verdict
     from splatpipe.pipeline.app.terminal.console import RunConsole
     from splatpipe.pipeline.engine.events import Event
+    from splatpipe.pipeline.engine.runs.line import StageStatus
     from splatpipe.pipeline.engine.runs.runner import Outcome
 
 # After Ctrl-C the notification gets what the report leaves of this: the command promises to end within five seconds,
@@ -203,3 +204,19 @@ def for_the_user(error: Exception) -> SplatpipeError:
             traceback.print_exception(error, file=file)
         hint = f"Please report it with {file.name}"
     return StageError(f"Internal error of splatpipe: {type(error).__name__}: {error}", hint)
+
+
+def status_as_json(status: StageStatus) -> dict[str, Any]:
+    """The status of a stage and of its shards, for ``status --json``."""
+    from splatpipe.pipeline.engine.runs.needs import used_and_forecast
+
+    artifact = status.artifact
+    return {
+        "name": status.stage.name,
+        "state": status.state,
+        "reason": status.reason,
+        "seconds": artifact.manifest["seconds"] if artifact else None,
+        "summary": artifact.summary if artifact else None,
+        **(used_and_forecast(artifact.manifest) if artifact else {}),
+        **({"shards": [status_as_json(shard) for shard in status.shards]} if status.shards else {}),
+    }

@@ -23,7 +23,7 @@ from splatpipe.pipeline.raster.cuda.cuda_api import (
     SplatStream,
 )
 from splatpipe.pipeline.raster.cuda.cuda_forecast import Forecast, most_pairs_of
-from splatpipe.pipeline.raster.cuda.cuda_library import CudaDevice, CudaLibrary, load, unavailable_reason
+from splatpipe.pipeline.raster.cuda.cuda_library import CudaLibrary, load, unavailable_reason
 from splatpipe.pipeline.splat.model.upload import upload
 
 ALIGNMENT = 256  # bytes, of memory passed to kernels
@@ -261,12 +261,6 @@ def kernels_of(device: torch.device) -> CudaKernels | None:
 @functools.cache
 def _on_cuda(index: int) -> CudaKernels | None:
     return None if unavailable_reason() else CudaKernels(load(), torch.device("cuda", index))
-
-
-def cuda_device(device: torch.device) -> CudaDevice | None:
-    """The device that CUDA kernels run on; None for the CPU."""
-    kernels = kernels_of(device)
-    return None if kernels is None else kernels.facts
 
 
 def _words(*numbers: int) -> tuple[int, ...]:

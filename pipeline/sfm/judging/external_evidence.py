@@ -11,7 +11,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.geometry.robust import absolute_weights
+from splatpipe.pipeline.geometry.robust import absolute_weights, robust_similarity
 from splatpipe.pipeline.sfm.judging.judging import Reason, is_trusted
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
@@ -111,28 +111,11 @@ def disagreement(centres: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray
         centres: Camera centres in the model's frame.
         places: Their stated positions, metres, in the same order.
     """
-    weights = np.ones(len(centres))
-    for _ in range(IRLS_ROUNDS):
-        residuals = _similar(centres, places, weights) - places
-        lengths = np.linalg.norm(residuals, axis=1)
-        weights = absolute_weights(lengths)
-    median = float(np.median(lengths))
+    _, residuals = robust_similarity(centres, places, absolute_weights, IRLS_ROUNDS)
+    median = float(np.median(np.linalg.norm(residuals, axis=1)))
     distances = np.linalg.norm(places[:, None] - places[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     nearest = np.argmin(distances, axis=1)
     apart = float(np.median(np.linalg.norm(residuals - residuals[nearest], axis=1)))
     size = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
     return PositionMisfit(median, size, apart / max(median, 1e-9))
-
-
-def _similar(
-    one: Float64[np.ndarray, "n 3"], two: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, " n"]
-) -> Float64[np.ndarray, "n 3"]:
-    """Align the first points to the second by the best weighted similarity (Umeyama, 1991)."""
-    shares = weights / weights.sum()
-    middle = shares @ one, shares @ two
-    a, b = one - middle[0], two - middle[1]
-    u, values, vt = np.linalg.svd(b.T @ (shares[:, None] * a))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = float((values * signs).sum() / (shares[:, None] * a**2).sum())
-    return np.asarray(scale * a @ (u @ np.diag(signs) @ vt).T + middle[1])

@@ -45,16 +45,6 @@ def file_bytes(file: BufferedIOBase) -> int:
     return os.fstat(file.fileno()).st_size
 
 
-def read_whole(path: Path) -> bytes:
-    """All bytes of a user's file.
-
-    Raises:
-        SplatpipeError: if it cannot be read.
-    """
-    with open_file(path) as file:
-        return _read(path, file, -1)
-
-
 def read_exactly(path: Path, file: BufferedIOBase, count: int) -> bytes:
     """Read exactly the next bytes of a file.
 

@@ -283,11 +283,11 @@ METRICS: dict[str, Metric] = {
 """Every metric by its name in metrics.json."""
 
 
-def ssim_window(dtype: torch.dtype = torch.float64) -> Float[Tensor, " 11"]:
+def _ssim_window() -> Float[Tensor, " 11"]:
     """The taps of SSIM's Gaussian window, which sum to one."""
     offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     taps = torch.exp(-0.5 * (offset / SSIM_SIGMA).square())
-    return (taps / taps.sum()).to(dtype)
+    return taps / taps.sum()
 
 
 def _planes(image: Tensor) -> Float[Tensor, "3 h w"]:
@@ -330,7 +330,7 @@ def _window_sums(
 
 def _blur(image: Float[Tensor, "h w"]) -> Tensor:
     """Means of whole windows (h - 10, w - 10), by OpenCV's separable filter, which runs in one thread."""
-    taps, radius = ssim_window().numpy(), SSIM_WINDOW // 2
+    taps, radius = _ssim_window().numpy(), SSIM_WINDOW // 2
     blurred = cv2.sepFilter2D(np.ascontiguousarray(image.numpy()), cv2.CV_64F, taps, taps)
     return torch.from_numpy(np.asarray(blurred))[radius:-radius, radius:-radius]
 

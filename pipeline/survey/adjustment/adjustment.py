@@ -17,8 +17,8 @@ import pycolmap
 from jaxtyping import Float64, Int64
 
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
-from splatpipe.pipeline.geometry.robust import cauchy_weights
-from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
+from splatpipe.pipeline.geometry.robust import cauchy_weights, robust_similarity
+from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED
 from splatpipe.pipeline.survey.adjustment.block import Block
 from splatpipe.pipeline.survey.adjustment.block_adjustment import (
@@ -239,12 +239,12 @@ def moved_px(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) ->
         return 0.0
     old = np.array([before.points3D[number].xyz for number in numbers])
     new = np.array([after.points3D[number].xyz for number in numbers])
-    weights = np.ones(len(numbers))
-    for _ in range(ROBUST_ROUNDS):  # distant points are seen by few photos, and would rotate the fit
-        scale, rotation, translation = fit_similarity(new, old, weights)
-        back = Similarity(float(scale), rotation, translation).apply(new)
-        distance = np.linalg.norm(back - old, axis=1)
-        weights = cauchy_weights(distance, max(float(np.median(distance)), 1e-300), half_at=1.0)
+
+    def weigh(distance: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        return cauchy_weights(distance, max(float(np.median(distance)), 1e-300), half_at=1.0)
+
+    # Distant points are seen by few photos, and would rotate the fit.
+    back = robust_similarity(new, old, weigh, ROBUST_ROUNDS)[0].apply(new)
     place = {number: k for k, number in enumerate(numbers)}
     squares: list[Float64[np.ndarray, " n"]] = []
     for number in sorted(before.reg_image_ids()):

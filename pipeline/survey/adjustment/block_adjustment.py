@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,7 +73,6 @@ def adjust_block(
     block: Block,
     positions: PositionObservations,
     offsets: Float64[np.ndarray, "g 3"] | None = None,
-    poll: Callable[[], None] = lambda: None,
 ) -> AdjustedBlock:
     """Adjust photos, lenses, tie points and the flights' offsets together.
 
@@ -82,14 +80,12 @@ def adjust_block(
         block: Near the solution.
         positions: Of its photos.
         offsets: The flights' initial ones; zero by default.
-        poll: Called between steps.
     """
     if offsets is None:
         offsets = np.zeros_like(positions.offset_sigmas)
     cost, damping, converged = block.cost() + positions.cost(block, offsets), DAMPING, False
     reduced = reduce_block(block)
     for _ in range(ROUNDS):
-        poll()
         normal, gradient = joint_system(reduced, positions, block, offsets)
         step = solve(_damped(normal, damping), -gradient)
         gain = -float(gradient @ step)

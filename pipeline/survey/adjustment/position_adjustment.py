@@ -121,7 +121,6 @@ class PositionAdjustment:
         accuracy: By propagation.
         judgement: Of the lens; None where it is held.
         reconstruction: The whole model, in its own frame as before.
-        feature_sigma_px: Standard deviation of a tie point's observation.
     """
 
     adjusted: AdjustedBlock
@@ -133,7 +132,6 @@ class PositionAdjustment:
     accuracy: BlockAccuracy
     judgement: LensJudgement | None
     reconstruction: pycolmap.Reconstruction
-    feature_sigma_px: float
 
     @property
     def errors(self) -> Float64[np.ndarray, "k 3"]:
@@ -206,7 +204,6 @@ def adjust_to_positions(
         accuracy_of(doubted(fit.adjusted, lenses) if lenses_held else fit.adjusted, fit.observed),
         judgement,
         whole,
-        sigma,
     )
 
 

@@ -29,13 +29,11 @@ class ConstellationMatch:
 
     Attributes:
         pairs: Indices of place and point.
-        residuals_m: Distance of each pair after the transformation.
         tolerance_m: Largest distance accepted.
         points_from_places: The transformation.
     """
 
     pairs: Int64[np.ndarray, "k 2"]
-    residuals_m: Float64[np.ndarray, " k"]
     tolerance_m: float
     points_from_places: Similarity
 
@@ -70,8 +68,8 @@ def overlay(
         current = _fitted(places, points, pairs)
         residuals = _distances(current.apply(places)[pairs[:, 0]], points[pairs[:, 1]])
         tolerance = min(TOLERANCE_M, max(MIN_TOLERANCE_M, RESIDUALS * float(np.median(residuals))))
-    pairs, residuals = _assigned(current.apply(places), points, tolerance)
-    return ConstellationMatch(pairs, residuals, tolerance, current) if len(pairs) >= MIN_MATCHES else None
+    pairs, _ = _assigned(current.apply(places), points, tolerance)
+    return ConstellationMatch(pairs, tolerance, current) if len(pairs) >= MIN_MATCHES else None
 
 
 def _agreed(

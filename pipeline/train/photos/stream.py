@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -58,16 +59,8 @@ class TrainingPhoto:
         return slice(top, bottom), slice(left, right)
 
 
-@dataclass(frozen=True)
-class _PendingPhoto:
-    """A photo being uploaded, with its other fields."""
-
-    camera: Camera
-    upload: Upload
-    is_empty: bool
-    inner: tuple[int, int, int, int] | None
-    share: float
-    round: int
+PendingPhoto = tuple[Upload, Callable[[Tensor, Tensor | None], TrainingPhoto]]
+"""A photo being uploaded, and what makes it of the uploaded colours and mask."""
 
 
 class PhotoStream:
@@ -98,7 +91,7 @@ class PhotoStream:
     ) -> None:
         self._views = views
         self._uploader = Uploader(torch.device("cpu"))
-        self._pending: deque[Future[_PendingPhoto]] = deque()
+        self._pending: deque[Future[PendingPhoto]] = deque()
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photos")
         self._cache = PhotoCache(cache)
         self.switch_order(order, first)
@@ -153,9 +146,8 @@ class PhotoStream:
             self._next += 1
         if not self._pending:
             raise StopIteration
-        sent = self._pending.popleft().result()
-        pixels = self._uploader.end(sent.upload)
-        return TrainingPhoto(sent.camera, *pixels, sent.is_empty, sent.inner, sent.share, sent.round)
+        upload, photo = self._pending.popleft().result()
+        return photo(*self._uploader.end(upload))
 
     def fill(self, report: Reporter) -> None:
         """Decode all photos before the first iteration: a full-size photo beside the model would take more memory.
@@ -197,7 +189,7 @@ class PhotoStream:
         for level, decoded in zip(fitting, reduced_views(view, self._order.max_megapixels, fitting), strict=True):
             self._cache.put((index, level), *decoded)
 
-    def _photo(self, iteration: int) -> _PendingPhoto:
+    def _photo(self, iteration: int) -> PendingPhoto:
         crop = self._order.at(iteration)
         window, whole = crop.window, crop.camera
         cut = window.grown(whole.width, whole.height)
@@ -205,14 +197,15 @@ class PhotoStream:
         mask = crop.valid_mask(mask, cut)
         left, top, right, bottom = inner = window.within(cut)
         here = window.pixels if mask is None else int(np.count_nonzero(mask[top:bottom, left:right]))
-        return _PendingPhoto(
+        photo = partial(
+            TrainingPhoto,
             whole.crop(cut.left, cut.top, cut.width, cut.height),
-            self._uploader.begin(pixels, mask),
-            here == 0,
-            None if cut == window else inner,
-            here / max(1, of_whole),
-            crop.round,
+            is_empty=here == 0,
+            inner=None if cut == window else inner,
+            share=here / max(1, of_whole),
+            round=crop.round,
         )
+        return self._uploader.begin(pixels, mask), photo
 
     def _decoded(self, crop: TrainingCrop, cut: PixelRectangle) -> tuple[Pixels, Mask | None, int]:
         """A part of a photo, its mask, and the number of the whole photo's pixels that count."""

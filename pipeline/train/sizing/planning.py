@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from splatpipe.pipeline.engine.errors import MachineError
+from splatpipe.pipeline.engine.heap import return_free_heap
+from splatpipe.pipeline.engine.machine import resident_bytes
 from splatpipe.pipeline.engine.stage import Machine, Reporter
 from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.raster.device import Device, cpu, free_bytes
@@ -16,14 +18,22 @@ from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
 from splatpipe.pipeline.train.appearance.sky import SkyModel
 from splatpipe.pipeline.train.options import FILM_FROM_BUDGET_S, TrainConfig
 from splatpipe.pipeline.train.plan.budget import FIRST_GROWTH, MIN_GAUSSIANS, BudgetTask, choose
-from splatpipe.pipeline.train.plan.limits import FIRST_ITERATIONS, device_bytes_per_gaussian, worthwhile_iterations
+from splatpipe.pipeline.train.plan.limits import (
+    FIRST_ITERATIONS,
+    FIXED_BYTES,
+    PIXEL_BYTES,
+    bytes_per_gaussian,
+    device_bytes_per_gaussian,
+    window_within,
+    worthwhile_iterations,
+)
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, footage_of
 from splatpipe.pipeline.train.plan.start import InitialGaussians, started
 from splatpipe.pipeline.train.plan.windows import TrainingSize
 from splatpipe.pipeline.train.sizing.measure import MachineSpeed, MeasuringBudget, TimedScene, measure
-from splatpipe.pipeline.train.sizing.memory_limit import within_memory
 from splatpipe.pipeline.train.sizing.shortage import HINT
 
+RESIDENT_STEP = 16_000_000  # resident memory is rounded up to it: a few pages more or less change no plan
 MEASURE_SHARE = 0.05  # share of the budget spent on measuring at most
 MEASURE_SECONDS = 10.0  # spent on measuring at most: by then the noise of a shared machine is averaged out
 PILOT_GROWTH_A_SECOND = {"cpu": 150.0, "cuda": 15_000.0}
@@ -75,6 +85,44 @@ def plan_within_budgets(plan: TrainingPlan, scene: PlanningInput, report: Report
         plan = within_time(plan, scene, report)
     start = scene.start
     return replace(plan, initial_gaussians=started(start.sparse, start.dense, plan.options.max_gaussians))
+
+
+def within_memory(plan: TrainingPlan, sparse: int, report: Reporter, on_cuda: bool = False) -> TrainingPlan:
+    """The plan with windows and a cap on Gaussians that keep the process, or a device's tensors, within the limit.
+
+    Args:
+        plan: The plan without the limit, which is ``max_memory_bytes`` of its options.
+        sparse: Number of initial Gaussians from sparse points; dense ones are dropped first, without a warning.
+        report: Receives a warning if those from sparse points have to be thinned.
+        on_cuda: Whether the training's tensors are on a CUDA device.
+
+    Raises:
+        MachineError: if not even the minimum fits beside what the process already uses.
+    """
+    return_free_heap()
+    limit, taken = plan.options.max_memory_bytes, -(-resident_bytes() // RESIDENT_STEP) * RESIDENT_STEP
+    of_one = bytes_per_gaussian(plan.options.sh_degree)
+    if on_cuda:
+        taken, of_one = 0, device_bytes_per_gaussian(plan.options.sh_degree)
+    room = limit - taken - FIXED_BYTES
+    plan = plan.within_windows(window_within(room, plan.window_pixels))
+    pixels = max(plan.footage.largest(stretch.training_size) for stretch in plan.schedule.stretches)
+    most = (room - PIXEL_BYTES * pixels) // of_one
+    if most < min(MIN_GAUSSIANS, sparse):
+        least = limit - room + PIXEL_BYTES * pixels + MIN_GAUSSIANS * of_one
+        raise MachineError(
+            f"Training cannot keep to {limit / 1e9:.2f} GB: the process takes {taken / 1e9:.2f} GB already, "
+            f"and {pixels / 1e6:.2f} megapixels of a photo need memory as well.",
+            hint=f"Give --max-memory at least {least / 1e6 + 1:.0f}M.",
+        )
+    if most < sparse:
+        report.warning(
+            f"{limit / 1e9:.2f} GB hold {most:,} Gaussians, fewer than the {sparse:,} sparse points: "
+            "every part of the scene is thinned evenly.",
+            hint="For a finer model, give more with --max-memory.",
+        )
+    cap = min(plan.options.max_gaussians, int(most))
+    return plan.of(plan.options.model_copy(update={"max_gaussians": cap}))
 
 
 def within_time(plan: TrainingPlan, scene: PlanningInput, report: Reporter) -> TrainingPlan:

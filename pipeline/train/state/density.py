@@ -12,55 +12,34 @@ those of the paper.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from splatpipe.pipeline.raster.rasterizer import Render
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
-from splatpipe.pipeline.train.densify import DensifiedGaussians, DensitySchedule, DensityStatistics, grow, prune_mask
+from splatpipe.pipeline.train.densify import DensifiedGaussians, DensitySchedule, grow, prune_mask
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
-
-
-@dataclass(frozen=True)
-class DensityStep:
-    """A step of density control.
-
-    Attributes:
-        schedule: The density-control schedule.
-        extent: Scene extent, world units.
-        limit: Maximum number of Gaussians after the step, if any are added.
-        iteration: The iteration that ends.
-        prune_mask: (n,) Gaussians to remove, whatever their size and opacity.
-        score_adjustment: How techniques modify the score; None for unmodified.
-    """
-
-    schedule: DensitySchedule
-    extent: float
-    limit: int
-    iteration: int
-    prune_mask: Bool[Tensor, " n"]
-    score_adjustment: Callable[[Float[Tensor, " n"]], Float[Tensor, " n"]] | None = None
+from splatpipe.pipeline.train.techniques.techniques import Techniques
 
 
 class Density:
-    """Density control, with the statistics since its last step.
+    """Density control, with sums over the photos since its last step.
 
     Args:
         count: Number of Gaussians in the model.
-        magnitudes: Rank by the summed magnitudes of the pixels' gradients, not by their signed sum.
         device: The model's device; None for the CPU.
 
     Attributes:
-        statistics: The score's sums.
+        score_sum: (n,) sum of the photos' scores.
+        seen: (n,) number of photos that saw the Gaussian.
+        max_radius_px: (n,) largest radius on screen; 0 where unseen.
     """
 
-    def __init__(self, count: int, magnitudes: bool, device: torch.device | None = None) -> None:
-        self.magnitudes = magnitudes
-        self.statistics = DensityStatistics(count, device)
+    def __init__(self, count: int, device: torch.device | None = None) -> None:
+        self.score_sum, self.seen, self.max_radius_px = (torch.zeros(count, device=device) for _ in range(3))
 
     def observe(
         self,
@@ -69,50 +48,74 @@ class Density:
         schedule: DensitySchedule,
         photo: TrainingPhoto,
     ) -> None:
-        """Add an iteration's statistics, after its step has produced the image-plane gradient.
+        """Add the NDC norm of an iteration's image-plane gradients, after its step has produced them.
 
         A window's gradients are scaled to its share of the whole photo, so that the score and its threshold mean the
-        same however a photo is divided.
+        same however a photo is divided. Non-finite scores count as 0.
 
         Args:
             rendered: The render compared with the photo, cut down to the n trained Gaussians.
-            gradient_px: With respect to the image-plane means, pixels; with ``magnitudes``, the summed magnitudes.
+            gradient_px: With respect to the image-plane means, pixels, or their summed magnitudes.
                 Either sparse, of the trained and visible Gaussians, or of all rendered ones, the n trained ones first.
             schedule: The density-control schedule.
             photo: The photo trained on.
         """
         whole = photo.camera.uncropped()
-        size = (photo.share * whole.width, photo.share * whole.height)
+        values = gradient_px.values() if gradient_px.is_sparse else gradient_px[: len(rendered.visible)]
+        width, height = photo.share * whole.width, photo.share * whole.height
+        score = torch.hypot(values[:, 0] * (0.5 * width), values[:, 1] * (0.5 * height)).nan_to_num_(0.0, 0.0, 0.0)
         if gradient_px.is_sparse:
-            self.statistics.observe_rows(gradient_px.indices()[0], gradient_px.values(), *size)
+            rows = gradient_px.indices()[0]
+            self.score_sum.index_add_(0, rows, score)
+            self.seen.index_add_(0, rows, torch.ones_like(score))
         else:
-            self.statistics.observe(gradient_px[: len(rendered.visible)], rendered.visible, *size)
+            self.score_sum += score.mul_(rendered.visible)
+            self.seen += rendered.visible
         if schedule.prune_screen_px > 0.0:
-            self.statistics.observe_radii(rendered.radii)
+            torch.maximum(self.max_radius_px, rendered.radii, out=self.max_radius_px)
 
-    def control(self, gaussians: Gaussians, step: DensityStep) -> tuple[DensifiedGaussians, dict[str, int]]:
+    def score(self) -> Float[Tensor, " n"]:
+        """Mean score over the photos that saw the Gaussian."""
+        return self.score_sum / self.seen.clamp(min=1.0)
+
+    def control(
+        self,
+        gaussians: Gaussians,
+        schedule: DensitySchedule,
+        extent: float,
+        limit: int,
+        iteration: int,
+        techniques: Techniques,
+    ) -> tuple[DensifiedGaussians, dict[str, int]]:
         """Prune, then clone or split the Gaussians of largest mean score, up to the limit; changes nothing itself.
+
+        Args:
+            gaussians: The model.
+            schedule: The density-control schedule.
+            extent: Scene extent, world units.
+            limit: Maximum number of Gaussians afterwards, if any are added.
+            iteration: The iteration that ends.
+            techniques: They reject Gaussians, and adjust the scores.
 
         Returns:
             The new rows of the model, and the counts of a ``DensityEvent``.
         """
-        schedule, extent, iteration = step.schedule, step.extent, step.iteration
-        gone = prune_mask(gaussians, schedule, extent, iteration, self.statistics.max_radius_px)
-        if not bool((gone | step.prune_mask).all()):  # a model is never emptied
-            gone |= step.prune_mask
+        rejected = techniques.prune_mask(gaussians, iteration)
+        gone = prune_mask(gaussians, schedule, extent, iteration, self.max_radius_px)
+        if rejected is not None and not bool((gone | rejected).all()):  # a model is never emptied
+            gone |= rejected
         pruned = int(gone.sum())
-        score = torch.where(gone, 0.0, self.statistics.score())
-        score = score if step.score_adjustment is None else step.score_adjustment(score)
-        growth, counts = grow(gaussians, score, step.limit - len(gaussians) + pruned, schedule, extent, iteration)
+        score = techniques.adjust_scores(torch.where(gone, 0.0, self.score()), gaussians, schedule)
+        growth, counts = grow(gaussians, score, limit - len(gaussians) + pruned, schedule, extent, iteration)
         return growth.select(~gone[growth.source]), {**counts, "pruned": pruned}
 
     def restart(self, count: int) -> None:
-        """Reset the statistics, because the model has new rows."""
-        self.statistics = DensityStatistics(count, self.statistics.seen.device)
+        """Reset the sums, because the model has new rows."""
+        self.score_sum, self.seen, self.max_radius_px = (self.seen.new_zeros(count) for _ in range(3))
 
     def to_arrays(self) -> dict[str, Tensor]:
         """The sums by name, for a checkpoint; not copied."""
-        return self.statistics.to_arrays()
+        return {"score_sum": self.score_sum, "seen": self.seen, "max_radius_px": self.max_radius_px}
 
     def load(self, arrays: Mapping[str, Tensor]) -> None:
         """The inverse of ``to_arrays``.
@@ -121,7 +124,7 @@ class Density:
             KeyError: if something is missing.
             RuntimeError: if it is for a different number of Gaussians.
         """
-        for name, tensor in self.statistics.to_arrays().items():
+        for name, tensor in self.to_arrays().items():
             if arrays[name].shape != tensor.shape:
                 raise RuntimeError(f"{name} is {tuple(arrays[name].shape)}, not {tuple(tensor.shape)}")
             tensor.copy_(arrays[name])

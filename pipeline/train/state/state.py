@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -32,7 +31,7 @@ from splatpipe.pipeline.train.densify import (
 from splatpipe.pipeline.train.plan.plan import TrainingPlan
 from splatpipe.pipeline.train.plan.schedule import ScheduleStep
 from splatpipe.pipeline.train.state.checkpoint import BrokenCheckpointError, Checkpoint, HostArrays
-from splatpipe.pipeline.train.state.density import Density, DensityStep
+from splatpipe.pipeline.train.state.density import Density
 from splatpipe.pipeline.train.state.history import History
 from splatpipe.pipeline.train.state.memory import within_room
 from splatpipe.pipeline.train.techniques.techniques import Techniques
@@ -89,18 +88,17 @@ class TrainState:
         sh[:, :shared] = start.sh[:, :shared]
         model = start.clone()
         model.sh = sh
-        return TrainState.of(model, plan, History(), techniques, frozen)
+        return TrainState.of(model, History(), techniques, frozen)
 
     @staticmethod
     def of(
         gaussians: Gaussians,
-        plan: TrainingPlan,
         history: History,
         techniques: Techniques,
         frozen: Gaussians | None = None,
     ) -> TrainState:
-        """A state of these Gaussians with everything else that the plan needs, untrained."""
-        density = Density(len(gaussians), plan.options.density == "absolute", gaussians.means.device)
+        """A state of these Gaussians with everything else untrained."""
+        density = Density(len(gaussians), gaussians.means.device)
         state = TrainState(gaussians, Adam(gaussians.tensors()), density, history, techniques=techniques)
         state._draw(gaussians, frozen)
         return state
@@ -205,24 +203,15 @@ class TrainState:
         """Give the model the rows that density control chooses, at most ``limit`` if it adds any."""
         _native.free_frames()  # they change size in this step, and memory is tight until then
         try:
-            growth, counts = self._growth(plan, limit, iteration)
+            growth, counts = self.density.control(  # no name for the old model: it is freed part by part below
+                self.gaussians.detach(), plan.schedule.density, plan.extent, limit, iteration, self.techniques
+            )
+            growth = along_curve(growth)
         except torch.OutOfMemoryError:  # the device has not even room to select what to grow
             self.history.growth_ended = self.history.growth_ended or iteration
             return
         self._adopt_growth(growth)
         self.history.add_density(DensityEvent(iteration, gaussians=len(self.gaussians), **counts))
-
-    def _growth(self, plan: TrainingPlan, limit: int, iteration: int) -> tuple[DensifiedGaussians, dict[str, int]]:
-        """The rows that density control chooses, and its counts; changes nothing."""
-        gaussians = self.gaussians.detach()
-        gone = self.techniques.prune_mask(gaussians, iteration)
-        if gone is None:
-            gone = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-        schedule = plan.schedule.density
-        score_adjustment = partial(self.techniques.adjust_scores, gaussians=gaussians, schedule=schedule)
-        step = DensityStep(schedule, plan.extent, limit, iteration, gone, score_adjustment)
-        growth, counts = self.density.control(gaussians, step)
-        return along_curve(growth), counts
 
     def _clear(self, iteration: int) -> None:
         """Remove the Gaussians that a technique rejects; this goes on after the last step of density control."""
@@ -313,7 +302,7 @@ class TrainState:
             gaussians = model.to(device)
             if gaussians.sh.shape[1] != coefficient_count(plan.options.sh_degree):
                 raise ValueError("another degree of spherical harmonics")
-            state = TrainState.of(gaussians, plan, History(**checkpoint.facts["history"]), techniques, frozen)
+            state = TrainState.of(gaussians, History(**checkpoint.facts["history"]), techniques, frozen)
             state.adam.load_state_dict(_under(_ADAM, tensors))
             state.iteration, state.seconds = int(checkpoint.facts["iteration"]), float(checkpoint.facts["seconds"])
             state.density.load(_under(_DENSITY, tensors))

@@ -67,6 +67,7 @@ def test_help_names_every_command_and_imports_nothing_heavy() -> None:
         (["demo", "{tmp}/out", "--time-budget", "soon"], 2, 'Cannot understand --time-budget "soon"'),
         (["run", "{photos}", "{tmp}/out", "--set", "georef.crs=EPSG:1"], 2, "There is no EPSG:1"),
         (["run", "{photos}", "{tmp}/out", "--set", "georef.vertical=sea"], 2, '"sea" is not a vertical datum'),
+        (["render", "{tmp}/out", "-o", "{tmp}/film.webm"], 2, "does not contain a run"),
         (["georef", "{tmp}/out", "--gcp", "{tmp}/none.txt"], 2, "does not contain a run"),
         (["stage", "train", "{tmp}/out"], 2, "does not contain a run"),
         (["stage", "trains", "{tmp}/out"], 2, "no stage"),

@@ -17,7 +17,8 @@ from command import answered, ran
 
 import splatpipe
 from splatpipe.demo import capture_path
-from splatpipe.pipeline.app.renders import RenderRequest, render_run
+from splatpipe.pipeline.app.render_request import RenderRequest
+from splatpipe.pipeline.app.renders import render_run
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.runs.run_folder import EVENTS_FILE
 from splatpipe.stages.line import LINE

@@ -6,11 +6,12 @@ import building_site
 import numpy as np
 import pytest
 import torch
+from block_borders import PlanLine
 from planted_seams import STRIP, colour_step, doubled, gap
 from seam_detector import KINDS, SEAM_LIMITS, Seam, border_cameras, find_seams
 
 from splatpipe.pipeline.geometry.camera import Camera
-from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 
 PLAN = GroundPlan.across(np.array([0.0, 0.0, 1.0]))

@@ -13,7 +13,8 @@ import torch
 from film_commands import SECONDS, render, rendered
 from PIL import Image
 
-from splatpipe.pipeline.app.renders import RenderRequest, RenderTask, render_run
+from splatpipe.pipeline.app.render_request import RenderRequest
+from splatpipe.pipeline.app.renders import RenderTask, render_run
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
 from splatpipe.pipeline.engine.runs.run_folder import open_run_folder
 from splatpipe.pipeline.engine.stage import Inputs

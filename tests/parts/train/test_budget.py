@@ -53,7 +53,7 @@ from splatpipe.pipeline.train.plan.limits import (
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, duration, make_plan
 from splatpipe.pipeline.train.plan.schedule import resolve_schedule
 from splatpipe.pipeline.train.plan.start import InitialGaussians
-from splatpipe.pipeline.train.sizing import memory_limit, planning, shortage
+from splatpipe.pipeline.train.sizing import planning, shortage
 from splatpipe.pipeline.train.sizing.measure import MachineSpeed, middle_of
 from splatpipe.pipeline.train.state.state import TrainState
 from splatpipe.stages import evaluate, initialize, train
@@ -395,35 +395,35 @@ def test_initial_gaussians_that_do_not_fit_are_thinned_with_a_warning_or_refused
 def test_memory_that_holds_the_sparse_points_takes_dense_ones_without_a_warning(
     plan: TrainingPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory_limit, "resident_bytes", lambda: 0)
+    monkeypatch.setattr(planning, "resident_bytes", lambda: 0)
     pixels = tiny_scene.WIDTH * tiny_scene.HEIGHT
     limit = FIXED_BYTES + PIXEL_BYTES * pixels + 2000 * bytes_per_gaussian(plan.options.sh_degree)
     limited = plan.of(plan.options.model_copy(update={"max_memory_bytes": limit}))
     for sparse, warnings in ((1500, 0), (2500, 1)):
         recorder = tiny_scene.Recorder()
-        capped = memory_limit.within_memory(replace(limited, initial_gaussians=50_000), sparse, recorder)
+        capped = planning.within_memory(replace(limited, initial_gaussians=50_000), sparse, recorder)
         assert capped.options.max_gaussians == 2000
         assert len(recorder.warnings) == warnings
     assert "2,000 Gaussians, fewer than the 2,500 sparse points" in recorder.warnings[0]
 
 
 def test_little_memory_takes_smaller_windows_before_it_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_limit, "resident_bytes", lambda: 0)
+    monkeypatch.setattr(planning, "resident_bytes", lambda: 0)
     views = [View(camera.scaled(2304, 1728), Path("photo.jpg"), None) for camera in tiny_scene.cameras()]
     plan = make_plan(TrainConfig(least_iterations=100), views, tiny_scene.split_of(views, 4), 150, 500_000)
     of_one, room = bytes_per_gaussian(3), 100_000_000
     limited = plan.of(plan.options.model_copy(update={"max_memory_bytes": FIXED_BYTES + room}))
-    fitted = memory_limit.within_memory(limited, 150, tiny_scene.Recorder())
+    fitted = planning.within_memory(limited, 150, tiny_scene.Recorder())
     assert fitted.window_pixels == pytest.approx(0.25 * room / PIXEL_BYTES, abs=1)
     assert (
         fitted.options.max_gaussians * of_one >= 0.74 * room and fitted.schedule.iterations > plan.schedule.iterations
     )
     least = FIXED_BYTES + PIXEL_BYTES * SMALLEST_WINDOW + MIN_GAUSSIANS * of_one
     tight = limited.of(plan.options.model_copy(update={"max_memory_bytes": least}))
-    assert memory_limit.within_memory(tight, 5000, tiny_scene.Recorder()).window_pixels == SMALLEST_WINDOW
+    assert planning.within_memory(tight, 5000, tiny_scene.Recorder()).window_pixels == SMALLEST_WINDOW
     refused = limited.of(plan.options.model_copy(update={"max_memory_bytes": FIXED_BYTES + of_one}))
     with pytest.raises(MachineError, match="need memory") as raised:
-        memory_limit.within_memory(refused, 5000, tiny_scene.Recorder())
+        planning.within_memory(refused, 5000, tiny_scene.Recorder())
     assert "at least" in raised.value.hint
 
 

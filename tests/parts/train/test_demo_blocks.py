@@ -13,7 +13,7 @@ from splatpipe.pipeline.splat.containers.ply import read_splat
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.blocks.assembly import count_and_degree, own_pieces
 from splatpipe.pipeline.train.blocks.cells.cutting import cut, shares, site, work_map
-from splatpipe.pipeline.train.blocks.cells.partition import Border, Partition
+from splatpipe.pipeline.train.blocks.cells.partition import Partition
 from splatpipe.pipeline.train.blocks.cells.photo_coverage import photo_coverages
 from splatpipe.pipeline.train.blocks.cells.visibility import block_views, windows
 
@@ -44,6 +44,5 @@ def test_demo_is_divided_assigned_to_photos_and_merged(demo_run: Path) -> None:
     assert min(view.covered for view in views) >= 0.95
     whole = merged(partition, dict.fromkeys(range(4), coarse))
     assert len(whole) == len(coarse)
-    assert all(isinstance(border, Border) for border in partition.borders())
     pictures = [render(model, cameras[3], options).colour.numpy() for model in (coarse, whole)]
     assert np.abs(pictures[0] - pictures[1]).max() < 2e-3  # only the order of equal depths differs

@@ -28,7 +28,7 @@ from splatpipe.pipeline.train.photos.upload import QUEUED, Upload, Uploader, col
 from splatpipe.pipeline.train.plan import limits
 from splatpipe.pipeline.train.plan.plan import TrainingPlan, make_plan
 from splatpipe.pipeline.train.plan.start import InitialGaussians
-from splatpipe.pipeline.train.sizing import memory_limit, planning
+from splatpipe.pipeline.train.sizing import planning
 from splatpipe.pipeline.train.sizing.planning import PlanningInput, pilot
 from splatpipe.pipeline.train.state import memory, state
 from splatpipe.pipeline.train.state.checkpoint import (
@@ -215,7 +215,8 @@ def test_growth_ends_when_the_device_has_no_memory_left(monkeypatch: pytest.Monk
     monkeypatch.setattr(state, "within_room", lambda wanted, gaussians, frozen: len(gaussians) + 3)
     plan = make_small_plan(ALL)
     training = TrainState.begin(tiny_scene.true_model(), plan, Techniques())
-    training.density.statistics.add(torch.ones(len(training.gaussians)), torch.ones(len(training.gaussians)) > 0.0)
+    training.density.score_sum += 1.0
+    training.density.seen += 1.0
     training.control_density(plan, plan.schedule.density.first)
     assert training.history.growth_ended == plan.schedule.density.first
     assert len(training.gaussians) == tiny_scene.GAUSSIANS + 3
@@ -226,7 +227,7 @@ def test_a_memory_limit_applies_to_the_device_that_trains() -> None:
     pixels = tiny_scene.WIDTH * tiny_scene.HEIGHT
     limit = limits.FIXED_BYTES + pixels * limits.PIXEL_BYTES + 5000 * each
     plan = make_small_plan(ALL.model_copy(update={"max_memory_bytes": limit, "max_gaussians": 1_000_000}))
-    assert memory_limit.within_memory(plan, 150, recorder, on_cuda=True).options.max_gaussians == 5000
+    assert planning.within_memory(plan, 150, recorder, on_cuda=True).options.max_gaussians == 5000
     # 236 bytes of parameters and 472 of moments, 12 of statistics; a tenth of a million more fit than on the CPU.
     assert 708 + 12 < each < limits.bytes_per_gaussian(TrainConfig().sh_degree)
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from splatpipe.pipeline.app.library.requests import overrides
-from splatpipe.pipeline.app.terminal.runs import with_budgets
+from splatpipe.pipeline.app.terminal.parameters import LineSettings
 from splatpipe.pipeline.engine.config import (
     current_options,
     dump,
@@ -53,7 +53,7 @@ def test_a_resolved_configuration_survives_its_file() -> None:
 
 @pytest.mark.parametrize("own", [[], ["train.max_megapixels=1.5"]], ids=("of the preset", "one's own"))
 def test_the_stored_configuration_of_a_run_with_budgets_has_the_same_budgets(tmp_path: Path, own: list[str]) -> None:
-    first = overrides(None, with_budgets(own, "10m", "4GB"), 3).resolve(load_preset("standard"))
+    first = overrides(None, LineSettings(own, "10m", "4GB").assignments(), 3).resolve(load_preset("standard"))
     assert first.train.max_megapixels == (1.5 if own else 0.0) and first.train.time_budget_s == 600.0
     kept = tmp_path / "config.toml"
     kept.write_text(dump(first.model_dump(mode="json") | {"photos": "photos", "splatpipe": "0.1"}))

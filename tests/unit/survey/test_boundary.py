@@ -12,7 +12,7 @@ from splatpipe.demo import capture_path
 from splatpipe.demo.photography.geodesy import Origin as DemoOrigin
 from splatpipe.pipeline.app.library.requests import overrides
 from splatpipe.pipeline.app.preflight.boundary import boundary_findings
-from splatpipe.pipeline.app.terminal.runs import with_boundary
+from splatpipe.pipeline.app.terminal.parameters import CaptureSettings
 from splatpipe.pipeline.engine.errors import SplatpipeError, StageError
 from splatpipe.pipeline.geometry.plan_area import PlanArea, read_model_area, read_world_area
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
@@ -302,7 +302,8 @@ def test_degrees_of_a_projected_system_are_refused(tmp_path: Path) -> None:
 
 def test_boundary_sets_the_option_and_set_takes_precedence() -> None:
     def resolved(assignments: list[str], boundary: str | None) -> str:
-        return overrides(None, with_boundary(assignments, boundary), None).resolve().georef.boundary
+        settings = CaptureSettings(assignments, boundary=boundary)
+        return overrides(None, settings.assignments(), None).resolve().georef.boundary
 
     assert resolved([], None) == "auto"
     assert resolved(["train.seed=3"], "site plan = 2.geojson") == "site plan = 2.geojson"

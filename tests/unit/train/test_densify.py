@@ -10,7 +10,6 @@ import torch
 
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.train.densify import (
-    DensityStatistics,
     grow,
     half_opacity,
     prune_mask,
@@ -132,17 +131,6 @@ def test_the_last_gaussian_is_never_pruned() -> None:
     gaussians = model([0.5, 0.5])
     gaussians.opacity_logits[:] = torch.tensor([-20.0, -19.0])
     assert prune_mask(gaussians, SCHEDULE, EXTENT, 50, torch.zeros(2)).tolist() == [True, False]
-
-
-def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
-    statistics = DensityStatistics(3)
-    gradient = torch.tensor([[3e-3, 4e-3], [1.0, 1.0], [math.nan, 0.0]])
-    statistics.observe(gradient, torch.tensor([True, False, True]), 200.0, 200.0)
-    statistics.observe(torch.zeros(3, 2), torch.tensor([True, False, True]), 200.0, 200.0)
-    torch.testing.assert_close(statistics.score(), torch.tensor([0.25, 0.0, 0.0]))
-    statistics.observe_radii(torch.tensor([1.0, 2.0, 0.0]))
-    statistics.observe_radii(torch.tensor([2.0, 1.0, 0.0]))
-    assert statistics.max_radius_px.tolist() == [2.0, 2.0, 0.0]
 
 
 def test_published_schedule_of_density_control() -> None:

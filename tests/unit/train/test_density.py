@@ -15,7 +15,8 @@ from splatpipe.pipeline.splat.model.sh import rgb_to_dc
 from splatpipe.pipeline.train.options import TrainConfig
 from splatpipe.pipeline.train.photos.stream import TrainingPhoto
 from splatpipe.pipeline.train.plan.schedule import resolve_schedule
-from splatpipe.pipeline.train.state.density import Density, DensityStep
+from splatpipe.pipeline.train.state.density import Density
+from splatpipe.pipeline.train.techniques.techniques import Techniques
 
 WIDTH, HEIGHT = 40, 30
 CAMERA = Camera("photo.png", WIDTH, HEIGHT, 35.0, 36.0, 20.5, 14.5, np.eye(4))
@@ -41,7 +42,7 @@ def picture(seed: int = 1) -> Tensor:
 
 def observed(magnitudes: bool, gaussians: Gaussians, weights: Tensor) -> Tensor:
     """The score after one photo whose loss is Σ weights · colour."""
-    density = Density(len(gaussians), magnitudes)
+    density = Density(len(gaussians))
     probe = torch.zeros(len(gaussians), 2, requires_grad=True)
     options = rasterizer.RenderOptions(0, near=0.2, depth=False, magnitudes=magnitudes)
     render = rasterizer.render(gaussians.requires_grad_(), CAMERA, options, means2d_probe=probe)
@@ -49,7 +50,7 @@ def observed(magnitudes: bool, gaussians: Gaussians, weights: Tensor) -> Tensor:
     assert probe.grad is not None
     with torch.no_grad():
         density.observe(render, probe.grad, SCHEDULE, TrainingPhoto(CAMERA, weights, None))
-    return density.statistics.score()
+    return density.score()
 
 
 def test_published_score_is_the_norm_of_the_gradient_by_screen_position() -> None:
@@ -81,24 +82,36 @@ def test_gradient_scores_are_those_of_the_reference(magnitudes: bool) -> None:
     torch.testing.assert_close(observed(magnitudes, gaussians, weights).double(), expected, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("magnitudes", [False, True])
-def test_density_control_keeps_to_the_limit_and_its_statistics_survive(magnitudes: bool) -> None:
+def test_density_control_keeps_to_the_limit_and_its_statistics_survive() -> None:
     schedule = replace(SCHEDULE, gradient=1e-9)
-    gaussians, density, again = scene(50), Density(50, magnitudes), Density(50, magnitudes)
-    density.statistics.add(torch.ones(50), torch.ones(50, dtype=torch.bool))
+    gaussians, density, again = scene(50), Density(50), Density(50)
+    density.score_sum += 1.0
+    density.seen += 1.0
     again.load({key: tensor.clone() for key, tensor in density.to_arrays().items()})
     for limit in (50, 61):
-        step = DensityStep(schedule, 5.0, limit, 600, torch.zeros(50, dtype=torch.bool))
-        growth, counts = density.control(gaussians, step)
+        step = (gaussians, schedule, 5.0, limit, 600, Techniques())
+        growth, counts = density.control(*step)
         assert len(growth.source) == limit
-        repeated, same = again.control(gaussians, step)
+        repeated, same = again.control(*step)
         assert same == counts
         assert torch.equal(repeated.means, growth.means) and torch.equal(repeated.source, growth.source)
     density.restart(61)
     assert all(not tensor.any() and len(tensor) == 61 for tensor in density.to_arrays().values())
 
 
+def test_score_is_the_ndc_gradient_averaged_over_the_photos_that_saw_it() -> None:
+    density, camera = Density(3), Camera("photo.png", 200, 200, 1.0, 1.0, 100.0, 100.0, np.eye(4))
+    schedule, photo = replace(SCHEDULE, prune_screen_px=1.0), TrainingPhoto(camera, torch.zeros(200, 200, 3), None)
+    visible, picture = torch.tensor([True, False, True]), torch.zeros(200, 200)
+    gradient = torch.tensor([[3e-3, 4e-3], [1.0, 1.0], [math.nan, 0.0]])
+    for each, radii in ((gradient, [1.0, 2.0, 0.0]), (torch.zeros(3, 2), [2.0, 1.0, 0.0])):
+        render = rasterizer.Render(photo.colour, *[picture] * 4, visible, torch.tensor(radii))
+        density.observe(render, each, schedule, photo)
+    torch.testing.assert_close(density.score(), torch.tensor([0.25, 0.0, 0.0]))
+    assert density.max_radius_px.tolist() == [2.0, 2.0, 0.0]
+
+
 def test_statistics_of_another_model_are_refused() -> None:
-    density = Density(3, True)
+    density = Density(3)
     with pytest.raises(RuntimeError, match="not"):
-        density.load(Density(4, True).to_arrays())
+        density.load(Density(4).to_arrays())

@@ -149,7 +149,7 @@ def test_the_sky_of_a_window_is_the_whole_photos_there(size: tuple[int, int]) ->
 def scores(photos: list[TrainingPhoto], magnitudes: bool) -> tuple[Tensor, Tensor]:
     """The density statistic's sum after some photos, and how many of them saw each Gaussian."""
     model = gaussians()
-    density = Density(len(model), magnitudes)
+    density = Density(len(model))
     schedule = resolve_schedule(TrainConfig(iterations=100)).density
     for photo in photos:
         probe = torch.zeros(len(model), 2, requires_grad=True)
@@ -158,7 +158,7 @@ def scores(photos: list[TrainingPhoto], magnitudes: bool) -> tuple[Tensor, Tenso
         photo_loss(rendered.colour, photo.colour, SSIM_WEIGHT, photo.mask, photo.inner).backward()
         assert probe.grad is not None
         density.observe(rendered, probe.grad, schedule, photo)
-    return density.statistics.score_sum, density.statistics.seen
+    return density.score_sum, density.seen
 
 
 @pytest.mark.parametrize("magnitudes", [True, False])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path, PurePosixPath
 
 from markupsafe import Markup
@@ -12,7 +11,7 @@ from markupsafe import Markup
 from splatpipe.pipeline.app.batch.pages.state import FINISHED, STALE_S, BatchState, CaptureState, Level, State
 from splatpipe.pipeline.app.page_file import page_text, printable, relative_link
 from splatpipe.pipeline.app.path_labels import PathLabels
-from splatpipe.pipeline.app.report.facts.wording import duration, plural, roughly, size
+from splatpipe.pipeline.app.report.facts.wording import duration, local_moment, plural, roughly, size
 from splatpipe.pipeline.app.thumbnails import Thumbnail, thumbnail
 from splatpipe.pipeline.engine.files.durable import write_durably
 
@@ -127,7 +126,7 @@ def batch_page(state: BatchState, folder: Path) -> str:
         groups=groups,
         total=len(state.captures),
         written_s=state.as_of_s,
-        written=_moment(state.as_of_s),
+        written=local_moment(state.as_of_s),
         silence_s=STALE_S,
         refresh_s=REFRESH_S,
     )
@@ -160,11 +159,13 @@ def _text(state: BatchState) -> str:
     until_s = state.as_of_s if state.ended_s is None else state.ended_s
     poor = sum(capture.level == "bad" and capture.state in FINISHED for capture in state.captures)
     sentences = [state.message, f"{poor:,} of the finished captures have poor results." if poor else ""]
-    sentences += [f"Began {_moment(state.began_s)}."]
+    sentences += [f"Began {local_moment(state.began_s)}."]
     if state.ended_s is not None:
-        sentences.append(f"Ended {_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")
+        sentences.append(f"Ended {local_moment(until_s)}, after {duration(max(0.0, until_s - state.began_s))}.")
     elif state.left_s is not None:
-        sentences.append(f"About {roughly(state.left_s)} left, until {_moment(until_s + state.left_s)} (forecast).")
+        sentences.append(
+            f"About {roughly(state.left_s)} left, until {local_moment(until_s + state.left_s)} (forecast)."
+        )
     if state.free_bytes is not None and (state.at_work or not state.all_succeeded):
         needed = f"; the remaining stages need about {size(state.needed_bytes)}" if state.needed_bytes else ""
         sentences.append(f"{size(state.free_bytes)} are free on the disk{needed}.")
@@ -219,11 +220,3 @@ def _lies_in(folder: Path, relative: str) -> bool:
         return (folder / path).is_file()
     except (OSError, ValueError):
         return False
-
-
-def _moment(seconds: float) -> str:
-    """A point in time in this machine's time zone, with the zone."""
-    try:
-        return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
-    except (OverflowError, OSError, ValueError):
-        return "at an unknown time"

@@ -91,6 +91,14 @@ def moment(seconds: object) -> str:
         return NONE
 
 
+def local_moment(seconds: float) -> str:
+    """A point in time in this machine's time zone, with the zone."""
+    try:
+        return f"{datetime.fromtimestamp(seconds).astimezone():%Y-%m-%d %H:%M %Z}"
+    except (OverflowError, OSError, ValueError):
+        return "at an unknown time"
+
+
 def interval(bounds: object) -> str:
     """The 95 % confidence interval."""
     if not isinstance(bounds, list | tuple) or len(bounds) != 2:
@@ -98,9 +106,9 @@ def interval(bounds: object) -> str:
     return f"{metres(bounds[0])} to {metres(bounds[1])}"
 
 
-def plural(amount: int, one: str, more: str = "") -> str:
+def plural(amount: int, one: str) -> str:
     """``1 photo``, ``2 photos``."""
-    return f"{amount:,} {one if amount == 1 else more or one + 's'}"
+    return f"{amount:,} {one if amount == 1 else one + 's'}"
 
 
 def judged_of(judged: int, held_out: int, one: str) -> str:

@@ -9,14 +9,13 @@ front of it belong together, and the photos of a flight see all heights of a pla
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanLine, PlanPoints
+from splatpipe.pipeline.geometry.ground_plan import GroundPlan, PlanPoints
 
 NO_OWNER = -1  # owner of a non-finite point
 
@@ -53,19 +52,6 @@ class Cell:
         """Distance of each place from the cell, plan units; 0 inside."""
         outside = np.maximum(np.maximum(np.array(self.low) - places, places - np.array(self.high)), 0.0)
         return np.asarray(np.hypot(outside[:, 0], outside[:, 1]))
-
-
-@dataclass(frozen=True)
-class Border:
-    """Where two blocks meet.
-
-    Attributes:
-        blocks: Their numbers, the smaller first.
-        line: The line between them.
-    """
-
-    blocks: tuple[int, int]
-    line: PlanLine
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,26 +100,6 @@ class Partition:
         """Which points lie in a block's cell or within a distance of it, plan units."""
         return self.cells[block].grown(distance).contains(self.places(points))
 
-    def borders(self) -> list[Border]:
-        """All lines where two blocks meet, within the site; lines that reach its edge continue outside."""
-        found = []
-        for number, cell in enumerate(self.cells):
-            for axis in (0, 1):
-                for at, others in ((cell.low[axis], "high"), (cell.high[axis], "low")):
-                    found += list(self._edge(number, axis, at, others))
-        return found
-
-    def _edge(self, number: int, axis: int, at: float, side: str) -> Iterator[Border]:
-        """The borders along one edge of a cell, with each neighbour of a greater number."""
-        cell = self.cells[number]
-        for other, neighbour in enumerate(self.cells):
-            if other == number or getattr(neighbour, side)[axis] != at:
-                continue
-            low = max(cell.low[1 - axis], neighbour.low[1 - axis])
-            high = min(cell.high[1 - axis], neighbour.high[1 - axis])
-            if low < high and other > number:
-                yield Border((number, other), _line(axis, at, low, high))
-
     def facts(self) -> dict[str, Any]:
         """The partition as JSON values; the numbers round-trip as float64."""
         return {
@@ -156,7 +122,3 @@ class Partition:
         if plan.up.shape != (3,) or not rows or not math.isfinite(margin) or margin < 0.0:
             raise ValueError("no partition")
         return Partition(plan, tuple(Cell((a, b), (c, d)) for a, b, c, d in rows), margin)
-
-
-def _line(axis: int, at: float, low: float, high: float) -> PlanLine:
-    return PlanLine((at, low), (at, high)) if axis == 0 else PlanLine((low, at), (high, at))
