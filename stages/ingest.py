@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +57,7 @@ from splatpipe.pipeline.survey.positions.position_sources import stated_places
 from splatpipe.pipeline.survey.positions.stated_positions import FilePlaces, read_places
 
 MIN_PHOTOS = 2
+MEASURES = "film.measures"  # of a film, from which a killed run goes on; no part, so that it does not outlast the stage
 
 
 def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -70,8 +73,9 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     part.mkdir(parents=True, exist_ok=True)
     filmed = is_film(given)
     root = part / FRAMES_DIR if filmed else given
+    _remove_leftovers(out, part, {root, out / MEASURES} if filmed else set())
     if filmed:
-        _report_film(extract_frames(given, root, config, inputs.machine.threads, report), report)
+        _report_film(extract_frames(given, root, config, inputs.machine.threads, report, out / MEASURES), report)
     if config.bands == AUTO and find_model(inputs.photos_dir) is not None:
         config = config.model_copy(update={"bands": ALL})  # a given model says which photos it is of
     work = Preparation(config, inputs.machine.threads, part, report)
@@ -115,6 +119,17 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
     }
+
+
+def _remove_leftovers(out: Path, part: Path, kept: AbstractSet[Path]) -> None:
+    """Remove what a killed run left, except for what is whole."""
+    for path in [*out.iterdir(), *part.iterdir()]:
+        if path in kept or path == part:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def _report_film(issues: Sequence[CaptureIssue], report: Reporter) -> None:
