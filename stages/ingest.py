@@ -15,7 +15,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.runs.source import find_model, is_film
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.files.names import NAMES_SHOWN, list_names, printable
+from splatpipe.pipeline.photos.files.names import NAMES_SHOWN, hint_of_several, list_names, printable
 from splatpipe.pipeline.photos.files.photo_list import (
     MASK_DIR,
     SKY_DIR,
@@ -227,7 +227,8 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
     if places.unknown:
         report.warning(
             f"{path.name} names photos that are missing, or names them twice: {list_names(places.unknown)}.",
-            "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
+            hint_of_several(places.unknown, [photo.name for photo in photos])
+            or "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
         )
     others = [photo.name for photo in photos if photo.name not in places.by_name and photo.exif.gps is not None]
     if others:
