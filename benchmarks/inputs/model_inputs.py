@@ -130,9 +130,9 @@ def missing_camera(folder: Path) -> None:
 
 
 MODEL_INPUTS = (
-    FieldInput("windows_folders", windows_folders, ("run cm out --until ingest",), 0),
-    FieldInput("several_models", several_models, ("run cm out --until sparse",), 0),
-    FieldInput("small_photos", small_photos, ("run cm out --until sparse",), 0),
-    FieldInput("other_extensions", other_extensions, ("run cm out --until sparse",), 0),
-    FieldInput("missing_camera", missing_camera, ("run cm out --until sparse",), 0),
+    FieldInput("windows_folders", windows_folders, ("run cm out --until georef",), 0),
+    FieldInput("several_models", several_models, ("run cm out --until georef",), 0),
+    FieldInput("small_photos", small_photos, ("run cm out --until georef",), 0),
+    FieldInput("other_extensions", other_extensions, ("run cm out --until georef",), 0),
+    FieldInput("missing_camera", missing_camera, ("run cm out --until georef",), 0),
 )

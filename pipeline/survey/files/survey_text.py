@@ -40,6 +40,10 @@ QUOTED, QUOTED_FIELD = re.compile(r'^"([^"]*)"$'), re.compile(r'(?:^|\s)"[^"]*"(
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 CODE = re.compile(r"EPSG\s*:|\+|WGS\s?84\s*/?\s*UTM", re.IGNORECASE)  # how a CRS begins that splatpipe knows by itself
 MAX_FOREIGN_SHARE = 0.05  # of letters beyond ASCII in a table of one of Windows' code pages, which none of them names
+MISWRITTEN = (  # what a number may have been meant to be, and how to write it
+    (re.compile("[°º]|[0-9] *[NSEW]$"), "Write degrees with decimals, negative in the south and west: 13.512690."),
+    (re.compile("^[0-9]{1,3}(?:['’,. ][0-9]{3})+"), "Write numbers without signs between thousands: 388710.51."),
+)
 CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 
 
@@ -262,7 +266,8 @@ def number_in(line: int, what: str, text: str) -> float:
     """
     text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
     if not is_number(text) or abs(float(text)) > MAX_COORDINATE:
-        raise LineError(line, f"{what} is {text[:40]!r}, which is not a valid number")
+        hint = next((hint for form, hint in MISWRITTEN if form.search(text)), "")
+        raise LineError(line, f"{what} is {text[:40]!r}, which is not a valid number", hint)
     return float(text)
 
 

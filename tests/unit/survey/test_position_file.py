@@ -186,3 +186,15 @@ def test_names_in_quotes_between_blanks_and_a_photo_with_two_positions(tmp_path:
     with pytest.raises(SplatpipeError, match=r"Line 3 of geo\.txt: DJI_0001\.JPG was in line 2 already") as caught:
         read_position_file(path)
     assert "one position" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("number", "way"),
+    [("13°30'46.8\"E", "degrees with decimals"), ("13 30 46 E", "degrees with decimals"), ("388'710.51", "thousands")],
+)
+def test_a_number_in_another_notation_is_refused_with_the_right_one(tmp_path: Path, number: str, way: str) -> None:
+    path = tmp_path / "positions.csv"
+    path.write_text(f"name;longitude;latitude\nDJI_0001.JPG;{number};47.8\n")
+    with pytest.raises(SplatpipeError, match="not a valid number") as caught:
+        read_position_file(path)
+    assert way in caught.value.hint
