@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.json_file import write_json
 from splatpipe.pipeline.engine.runs.source import find_model, is_film
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
-from splatpipe.pipeline.photos.files.names import NAMES_SHOWN, list_names, printable
+from splatpipe.pipeline.photos.files.names import NAMES_SHOWN, hint_of_several, list_names, printable
 from splatpipe.pipeline.photos.files.photo_list import (
     MASK_DIR,
     SKY_DIR,
@@ -55,6 +57,7 @@ from splatpipe.pipeline.survey.positions.position_sources import stated_places
 from splatpipe.pipeline.survey.positions.stated_positions import FilePlaces, read_places
 
 MIN_PHOTOS = 2
+MEASURES = "film.measures"  # of a film, from which a killed run goes on; no part, so that it does not outlast the stage
 
 
 def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
@@ -70,8 +73,9 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     part.mkdir(parents=True, exist_ok=True)
     filmed = is_film(given)
     root = part / FRAMES_DIR if filmed else given
+    _remove_leftovers(out, part, {root, out / MEASURES} if filmed else set())
     if filmed:
-        _report_film(extract_frames(given, root, config, inputs.machine.threads, report), report)
+        _report_film(extract_frames(given, root, config, inputs.machine.threads, report, out / MEASURES), report)
     if config.bands == AUTO and find_model(inputs.photos_dir) is not None:
         config = config.model_copy(update={"bands": ALL})  # a given model says which photos it is of
     work = Preparation(config, inputs.machine.threads, part, report)
@@ -115,6 +119,17 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         "sky_masks": len(skies),
         "megapixels": round(sum(photo.width * photo.height for photo in photos) / 1e6, 3),
     }
+
+
+def _remove_leftovers(out: Path, part: Path, kept: AbstractSet[Path]) -> None:
+    """Remove what a killed run left, except for what is whole."""
+    for path in [*out.iterdir(), *part.iterdir()]:
+        if path in kept or path == part:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def _report_film(issues: Sequence[CaptureIssue], report: Reporter) -> None:
@@ -212,7 +227,8 @@ def _places(inputs: Inputs, photos: Sequence[CheckedPhoto], report: Reporter) ->
     if places.unknown:
         report.warning(
             f"{path.name} names photos that are missing, or names them twice: {list_names(places.unknown)}.",
-            "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
+            hint_of_several(places.unknown, [photo.name for photo in photos])
+            or "Names are compared without folders and letter case; correct them, or leave the photos out of the file.",
         )
     others = [photo.name for photo in photos if photo.name not in places.by_name and photo.exif.gps is not None]
     if others:

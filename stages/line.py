@@ -33,6 +33,7 @@ INGEST = Stage(
         "positions": NamedFile("source.geo", ("geo.txt", "positions.csv")),
         "lens": NamedFile("source.lens", ("lens.xml", "lens.txt", "lens.cam")),
     },
+    resumable=True,
 )
 FEATURES = Stage(
     "features",

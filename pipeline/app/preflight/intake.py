@@ -15,7 +15,7 @@ from splatpipe.pipeline.app.preflight.findings import Finding, LeftOutPhoto
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.runs.source import RunSource, is_film
 from splatpipe.pipeline.engine.stage import JSON, Reporter
-from splatpipe.pipeline.photos.files.names import list_names, printable
+from splatpipe.pipeline.photos.files.names import hint_of_several, list_names, printable
 from splatpipe.pipeline.photos.files.photo_list import Photo, photo_root
 from splatpipe.pipeline.photos.files.scan import ExcludedPhoto, by_reason, with_reason
 from splatpipe.pipeline.photos.intake.bands import ALL
@@ -157,7 +157,8 @@ def _file_places(
     if not places.unknown:
         return places, []
     text = f"{path.name} names photos that are missing, or names them twice: {list_names(places.unknown)}."
-    return places, [Finding("positions-file", "warning", text, "Correct the names, or leave them out.")]
+    hint = hint_of_several(places.unknown, names) or "Correct the names, or leave them out."
+    return places, [Finding("positions-file", "warning", text, hint)]
 
 
 def _left_out(chosen: Selection) -> list[Finding]:
@@ -166,16 +167,8 @@ def _left_out(chosen: Selection) -> list[Finding]:
         kind: [entry for entry in chosen.left_out if entry.kind == kind]
         for kind in ("unusable", "duplicate", "companion")
     }
-    hint = "A run leaves it out: copy it from the card again, or retake the photo."
-    hints = "A run leaves them out: copy them from the card again, or retake the photos."
     findings = [
-        Finding(
-            "unreadable",
-            "warning",
-            f"{with_reason(names, reason)}.",
-            hint if len(names) == 1 else hints,
-            tuple(sorted(names)),
-        )
+        Finding("unreadable", "warning", f"{with_reason(names, reason)}.", _hint(reason, names), tuple(sorted(names)))
         for reason, names in sorted(by_reason(of_kind["unusable"]).items())
     ]
     findings += _duplicates(of_kind["duplicate"])
@@ -187,6 +180,13 @@ def _left_out(chosen: Selection) -> list[Finding]:
         names = [mask.name for mask in chosen.masks]
         findings.append(Finding("companions", "note", f"Masks of photos: {list_names(names)}.", "A run applies them."))
     return findings
+
+
+def _hint(reason: str, names: Sequence[str]) -> str:
+    """What to do about photos that are left out: only what is broken is worth another copy."""
+    it, photo = ("it", "the photo") if len(names) == 1 else ("them", "the photos")
+    broken = any(word in reason for word in ("damaged", "truncated", "empty", "cannot be read", "no valid pixel"))
+    return f"A run leaves {it} out" + (f": copy {it} from the card again, or retake {photo}." if broken else ".")
 
 
 def _duplicates(entries: Sequence[ExcludedPhoto]) -> list[Finding]:

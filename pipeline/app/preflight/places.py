@@ -20,7 +20,7 @@ from splatpipe.pipeline.survey.crs.crs import Crs, to_geodetic
 from splatpipe.pipeline.survey.files.control_file import ControlFile, read_control_file
 from splatpipe.pipeline.survey.files.scale_bars import read_scale_bars
 from splatpipe.pipeline.survey.options import GeorefConfig
-from splatpipe.pipeline.survey.points.surveyed_points import check_names, eaten_zeros, missing_photos
+from splatpipe.pipeline.survey.points.surveyed_points import check_names, missing_photos, name_hint
 
 OUTSIDE_SHARE = 0.3  # share of marks outside their photos above which these had another size, which ends a run
 ELSEWHERE_M = 1000.0  # from the photos: another zone or another CRS
@@ -125,12 +125,12 @@ def _mark_findings(name: str, file: ControlFile, intake: Intake, half_pixel: flo
                 outside.append(f"{point} in {photo}")
     findings = []
     if marks and all(photo is None for _, _, photo in marks):
-        text = f"None of the photos that {name} names is in this capture: {list_names(missing)}."
-        hint = eaten_zeros(missing, sizes) or "Check that the file belongs to these photos."
+        text = f"None of the photos that {name} names can be found in this capture: {list_names(missing)}."
+        hint = name_hint(missing, sizes) or "Check that the file belongs to these photos."
         return [Finding("control-broken", "error", text, hint)]
     if missing:
         text = f"{name} names {missing_photos(missing)}."
-        hint = eaten_zeros(missing, sizes) or "Correct the names, or add the photos."
+        hint = name_hint(missing, sizes) or "Correct the names, or add the photos."
         findings.append(Finding("control-marks", "warning", text, f"Their marks are ignored. {hint}"))
     if outside:
         severe = len(outside) > OUTSIDE_SHARE * len(marks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Callable, Iterable
 from pathlib import PurePath, PurePosixPath
 
@@ -32,18 +33,37 @@ class NameFinder:
     """
 
     def __init__(self, photos: Iterable[str]) -> None:
-        self._tables: list[tuple[Callable[[str], str], dict[str, str | None]]] = []
+        self._tables: list[tuple[Callable[[str], str], dict[str, list[str]]]] = []
         names = list(dict.fromkeys(photos))
         for key in (str, _folded, _without_suffix, _last, lambda name: _without_suffix(_last(name))):
-            table: dict[str, str | None] = {}
+            table: dict[str, list[str]] = {}
             for name in names:
-                table[key(name)] = None if key(name) in table else name
+                table.setdefault(key(name), []).append(name)
             self._tables.append((key, table))
 
     def __call__(self, name: str) -> str | None:
         """Return the photo's name; None if there is none, or if there are several."""
-        found = (table.get(key(name)) for key, table in self._tables)
-        return next((photo for photo in found if photo is not None), None)
+        found = (table.get(key(name), []) for key, table in self._tables)
+        return next((photos[0] for photos in found if len(photos) == 1), None)
+
+    def several(self, name: str) -> list[str]:
+        """Return the photos that a name may mean, if they are several and none fits better."""
+        found = (table.get(key(name), []) for key, table in self._tables)
+        return [] if self(name) is not None else next((photos for photos in found if photos), [])
+
+
+def hint_of_several(names: Iterable[str], photos: Iterable[str]) -> str:
+    """What to do about names that may mean several photos; empty if there are none.
+
+    Args:
+        names: As a file has them.
+        photos: Names of all photos.
+    """
+    find = NameFinder(sorted(photos))
+    found = next(((name, several) for name in names if (several := find.several(name))), None)
+    if found is None:
+        return ""
+    return f"{printable(found[0])} may be {list_names(found[1], 3)}: write the photos' folders before their names."
 
 
 def match_names(names: Iterable[str], photos: Iterable[str]) -> dict[str, str]:
@@ -69,7 +89,7 @@ def match_names(names: Iterable[str], photos: Iterable[str]) -> dict[str, str]:
 
 
 def _folded(name: str) -> str:
-    return name.replace("\\", "/").casefold()
+    return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()  # Macs take letters and accents apart
 
 
 def _last(name: str) -> str:

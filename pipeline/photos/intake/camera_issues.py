@@ -11,6 +11,7 @@ from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 
 MAX_MINORITY_SHARE = 0.25  # share of the photos above which a camera was used on purpose
+VOWELS = frozenset("aeioAEIO")  # letters before which "an" is said
 
 
 def find_camera_issues(
@@ -117,7 +118,8 @@ def _body(photo: CheckedPhoto) -> tuple[str, str, str]:
 def _describe(photo: CheckedPhoto) -> str:
     name = camera_name(photo.exif.make, photo.exif.model)
     focal = _focal(photo)
-    return f"a {name}" + (f" ({focal})" if focal != "unknown" else "")
+    article = "an" if name[0] in VOWELS else "a"
+    return f"{article} {name}" + (f" ({focal})" if focal != "unknown" else "")
 
 
 def _focal(photo: CheckedPhoto) -> str:

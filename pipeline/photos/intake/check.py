@@ -33,6 +33,7 @@ MAX_FILE_BYTES = 2 << 30
 DRAFT = 8  # libjpeg reads every coefficient of a JPEG, whatever the scale of the pixels that it computes
 FINGERPRINT_STEP = 8
 TAG_ORIENTATION = 274
+TIFF_MAGIC = (b"II*\0", b"MM\0*")
 TAG_BITS_PER_SAMPLE = 258
 TAGS_GEOTIFF = (33550, 34735)  # ModelPixelScale, GeoKeyDirectory: the size of a map's pixels on the ground, its CRS
 PANORAMA = re.compile(r"(?:^|[ ._-])pano(?:rama)?(?:[ ._-]|\d|$)")  # in the names of stitched ones
@@ -104,7 +105,7 @@ def check_photo(candidate: Candidate, limits: PictureLimits) -> CheckedPhoto | E
     try:
         picture = open_picture(BytesIO(data))
     except Exception as error:  # Pillow's readers raise almost anything on broken images
-        return ExcludedPhoto(candidate.name, _decode_problem(error))
+        return ExcludedPhoto(candidate.name, _decode_problem(error, data[:4]))
     with picture:
         reason = _refusal_reason(picture, data, limits) or sparse_data_reason(picture, data)
         return ExcludedPhoto(candidate.name, reason) if reason else _decode(candidate, data, sha256, picture)
@@ -296,10 +297,12 @@ def _xmp_bytes(picture: Image.Image) -> bytes:
     return packet if isinstance(packet, bytes) else str(packet).encode()
 
 
-def _decode_problem(error: Exception) -> str:
+def _decode_problem(error: Exception, magic: bytes = b"") -> str:
     text = str(error)
     if "truncated" in text.lower() or isinstance(error, EOFError):
         return "is truncated: it ends before its last pixel; copy it again from the camera"
+    if "cannot identify" in text and magic in TIFF_MAGIC:
+        return "is damaged, or a TIFF of a kind that is not read: save it with 8 or 16 bits for each colour"
     if "cannot identify" in text:
         return "is damaged: its header cannot be read"
     detail = " ".join(text.split())[:120]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import datetime
-import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import shutil
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,26 +17,25 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.files.output_file import new_file
+from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.runs.source import subtitles_beside
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.files.names import is_plain, printable
 from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.options import IngestConfig
-from splatpipe.pipeline.photos.video.boxes import REFILM, Container, read_container
+from splatpipe.pipeline.photos.video.boxes import Container, read_container
 from splatpipe.pipeline.photos.video.choice import Choice, choose
-from splatpipe.pipeline.photos.video.motion import Measures, joined, measure
+from splatpipe.pipeline.photos.video.measuring import measure_film, open_film
+from splatpipe.pipeline.photos.video.motion import Measures
 from splatpipe.pipeline.photos.video.telemetry import FlightPath, Place, read_fixes, read_subtitles
 
 FRAMES_DIR = "frames"  # in the part `photos`
 MIN_FRAMES = 3  # a reconstruction needs as many
-MEASURED_FPS = 15.0  # frames per second that are measured: of a faster film every second, third or further one
 JPEG_QUALITY = 97  # JPEG quality of extracted frames, without subsampled colours: the film's own losses are larger
 MAX_STEM_BYTES = 200  # longest film name used for frames, which a number, masks and conversions make longer
 ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}  # EXIF's, by a player's turn, degrees clockwise
 # median motion between frames over the frame's size, above which a rolling shutter may shear them
 MAX_MOTION_SHARE = 0.005
-MIN_DECODED_SHARE = 0.98  # least share of the listed frames that decode in an undamaged film
 TAG, GPS = ExifTags.Base, ExifTags.GPS
 XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -59,16 +58,17 @@ class Flight:
 
 
 def extract_frames(
-    film: Path, folder: Path, config: IngestConfig, threads: int, report: Reporter
+    film: Path, folder: Path, config: IngestConfig, threads: int, report: Reporter, kept: Path | None = None
 ) -> list[CaptureIssue]:
     """Choose a film's frames and write them into a folder.
 
     Args:
         film: An MP4 or MOV.
-        folder: Where the frames go; created.
+        folder: Where the frames go; created. Those that a killed run wrote into it stay; other files are removed.
         config: `ingest`'s options.
         threads: For decoding.
         report: Receives the progress.
+        kept: File of what was measured, from which a killed run goes on; None: nothing is kept.
 
     Returns:
         What is to be told of the film.
@@ -85,7 +85,7 @@ def extract_frames(
             hint="Give a film of a camera.",
         )
     flight = _flight(film, container)
-    measures = _measure(film, container, threads, report)
+    measures = measure_film(film, container, threads, report, kept)
     choice = choose(measures, config.max_frames)
     if len(choice.chosen) < MIN_FRAMES:
         raise SplatpipeError(
@@ -104,51 +104,6 @@ class _Frame:
     name: str
     exif: Image.Exif
     xmp: bytes
-
-
-@contextmanager
-def _opened(film: Path, threads: int) -> Iterator[cv2.VideoCapture]:
-    capture = cv2.VideoCapture(str(film), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, max(1, threads)])
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    try:
-        yield capture
-    finally:
-        capture.release()
-
-
-def _measure(film: Path, container: Container, threads: int, report: Reporter) -> Measures:
-    name = printable(film.name)
-    decoded = [0]
-
-    def frames() -> Iterator[tuple[int, float, UInt8[np.ndarray, "h w 3"]]]:
-        fps = container.frames / container.seconds if container.seconds > 0.0 else MEASURED_FPS
-        stride = max(1, round(fps / MEASURED_FPS))
-        with _opened(film, threads) as capture:
-            for number in range(container.frames):
-                if not capture.grab():
-                    return
-                decoded[0] = number + 1
-                if number % stride:
-                    continue
-                time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-                read, pixels = capture.retrieve()
-                if read and pixels is not None and pixels.ndim == 3:
-                    yield number, time_s, np.asarray(pixels, np.uint8)
-                report.progress(number + 1, container.frames, "measuring the film", "frames")
-
-    measures = joined(measure(frames()))
-    if len(measures) == 0:
-        raise SplatpipeError(
-            f"None of the {container.frames:,} frames of {name} can be decoded: it has no key frame, or a codec "
-            f"({printable(container.codec)}) that OpenCV lacks.",
-            hint=f"If it plays, convert it: ffmpeg -i {shlex.quote(name)} -c:v libx264 -crf 16 readable.mp4; "
-            "else copy it again.",
-        )
-    if decoded[0] < MIN_DECODED_SHARE * container.frames:
-        raise SplatpipeError(
-            f"{name} is damaged: only {decoded[0]:,} of its {container.frames:,} frames can be decoded.", hint=REFILM
-        )
-    return measures
 
 
 def _flight(film: Path, container: Container) -> Flight:
@@ -225,12 +180,13 @@ def _sexagesimal(degrees: float) -> tuple[IFDRational, IFDRational, IFDRational]
 
 
 def _write(film: Path, folder: Path, frames: Sequence[_Frame], threads: int, report: Reporter) -> None:
-    """Decode the film once more, as seeking lands on other frames, and write the chosen ones."""
+    """Decode the film once more, as seeking lands on other frames, and write the chosen ones that are missing."""
     folder.mkdir(parents=True, exist_ok=True)
-    wanted: Mapping[int, _Frame] = {frame.number: frame for frame in frames}
-    written = 0
-    with _opened(film, threads) as capture:
-        for number in range(frames[-1].number + 1):
+    whole = _keep_only({frame.name for frame in frames}, folder)
+    wanted: Mapping[int, _Frame] = {frame.number: frame for frame in frames if frame.name not in whole}
+    written = len(whole)
+    with open_film(film, threads) as capture:
+        for number in range(max(wanted, default=-1) + 1):
             if not capture.grab():
                 break
             if number not in wanted:
@@ -245,12 +201,24 @@ def _write(film: Path, folder: Path, frames: Sequence[_Frame], threads: int, rep
         raise SplatpipeError(f"{printable(film.name)} changed while it was read.", hint="Run again.")
 
 
+def _keep_only(names: AbstractSet[str], folder: Path) -> set[str]:
+    """Remove all but the files of these names, which were written whole; return the names of those that are there."""
+    for path in folder.iterdir():
+        if path.name in names and path.is_file() and not path.is_symlink():
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    return {path.name for path in folder.iterdir()}
+
+
 def _save(pixels: UInt8[np.ndarray, "h w 3"], frame: _Frame, folder: Path) -> None:
     settings: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0, "exif": frame.exif.tobytes()}
     if frame.xmp:
         settings["xmp"] = frame.xmp
-    with new_file(folder / frame.name) as file:
-        Image.fromarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)).save(file, "JPEG", **settings)
+    picture = Image.fromarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+    write_durably(folder / frame.name, lambda file: picture.save(file, "JPEG", **settings))
 
 
 def _issues(film: Path, container: Container, measures: Measures, choice: Choice, flight: Flight) -> list[CaptureIssue]:

@@ -5,8 +5,7 @@ Only two small grey pictures are held at a time.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -21,6 +20,7 @@ WINDOW, LEVELS = (15, 15), 3  # search window (pixels) and pyramid levels of the
 TOLERANCE_PX = 1.5  # off the common motion: nearer and farther ground moves differently
 MIN_FOLLOWED, MIN_SHARE = 12, 0.25  # corners, and their share that agrees
 AREA_RATIO_BOUNDS = (0.5, 2.0)  # bounds on the ratio of areas from frame to frame
+ROW = 12  # numbers that are measured of a frame
 MAX_LOST_FRAMES = 15  # frames without motion, such as a flash, before it counts as a cut
 
 
@@ -45,40 +45,42 @@ class Measures:
         return len(self.frames)
 
 
-def measure(film: Iterable[tuple[int, float, UInt8[np.ndarray, "h w 3"]]]) -> Iterator[Measures]:
-    """Measure frames one after the other.
+@dataclass(eq=False)
+class FilmMeter:
+    """Measures frames one after the other.
 
-    Args:
-        film: Number, time in seconds, and pixels (BGR) of each frame.
-
-    Yields:
-        The measures of each frame, to be joined by ``joined``.
+    Attributes:
+        rows: What was measured of each frame so far: number, time, sharpness, and the nine numbers of the step.
+        last: The small grey picture that motion is measured from; None before the first frame.
+        waited: Frames since then that show something else.
     """
+
+    rows: list[Float64[np.ndarray, " 12"]] = field(default_factory=list)
     last: UInt8[np.ndarray, "h w"] | None = None
-    waited = 0
-    for number, time_s, pixels in film:
+    waited: int = 0
+
+    @property
+    def begun(self) -> int:
+        """The number of the first frame that is not measured yet."""
+        return int(self.rows[-1][0]) + 1 if self.rows else 0
+
+    def add(self, number: int, time_s: float, pixels: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Measure the next frame: its number, time in seconds, and pixels (BGR)."""
         grey = reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), SHARP_SIDE)
         small = reduced(grey, TRACKED_SIDE)
-        step = None if last is None else motion(last, small)
-        if step is not None or last is None or waited >= MAX_LOST_FRAMES:
-            last, waited = small, 0
+        step = None if self.last is None else motion(self.last, small)
+        if step is not None or self.last is None or self.waited >= MAX_LOST_FRAMES:
+            self.last, self.waited = small, 0
         else:
-            waited += 1  # compared again with the last good frame; this one is not chosen
-        sharp = 0.0 if waited else sharpness(grey)
-        step = np.eye(3) if waited else step
-        steps = np.full((1, 3, 3), np.nan) if step is None else step[None]
-        yield Measures(np.array([number]), np.array([time_s]), np.array([sharp]), steps)
+            self.waited += 1  # compared again with the last good frame; this one is not chosen
+        sharp = 0.0 if self.waited else sharpness(grey)
+        step = np.eye(3) if self.waited else step
+        self.rows.append(np.array([number, time_s, sharp, *(np.full(9, np.nan) if step is None else step.ravel())]))
 
-
-def joined(parts: Iterable[Measures]) -> Measures:
-    """Join the measures of frames."""
-    found = list(parts)
-    return Measures(
-        np.concatenate([np.zeros(0, np.int64), *(part.frames for part in found)]),
-        np.concatenate([np.zeros(0), *(part.times_s for part in found)]),
-        np.concatenate([np.zeros(0), *(part.sharpness for part in found)]),
-        np.concatenate([np.zeros((0, 3, 3)), *(part.steps for part in found)]),
-    )
+    def measures(self) -> Measures:
+        """What was measured so far."""
+        table = np.array(self.rows).reshape(-1, ROW)
+        return Measures(table[:, 0].astype(np.int64), table[:, 1], table[:, 2], table[:, 3:].reshape(-1, 3, 3))
 
 
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:

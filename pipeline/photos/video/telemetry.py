@@ -28,17 +28,18 @@ from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.photos.video.boxes import MAX_CUE_BYTES, MAX_CUES, Cue
 
 NUMBER = r"([-+]?\d{1,6}(?:\.\d{1,12})?)(?![\d.eE])"
-LATITUDE = re.compile(rf"\blatitude\s{{0,3}}:\s{{0,3}}{NUMBER}", re.IGNORECASE)
-LONGITUDE = re.compile(rf"\blongt?itude\s{{0,3}}:\s{{0,3}}{NUMBER}", re.IGNORECASE)  # DJI writes both
+VALUE = r"([-+]?\d{1,6}(?:[.,]\d{1,12})?)(?![\d.eE])"  # alone, so that a comma before digits is a decimal one
+LATITUDE = re.compile(rf"\blatitude\s{{0,3}}:\s{{0,3}}{VALUE}", re.IGNORECASE)
+LONGITUDE = re.compile(rf"\blongt?itude\s{{0,3}}:\s{{0,3}}{VALUE}", re.IGNORECASE)  # DJI writes both
 GPS = re.compile(
     rf"\b(?:GPS|RTK)\s{{0,3}}\(\s{{0,3}}([NSEW])?[\s:]{{0,3}}{NUMBER}\s{{0,3}},\s{{0,3}}([NSEW])?[\s:]{{0,3}}{NUMBER}",
     re.IGNORECASE,
 )
-ALTITUDE = re.compile(rf"\b(?:abs_alt|altitude)\s{{0,3}}:\s{{0,3}}{NUMBER}", re.IGNORECASE)
+ALTITUDE = re.compile(rf"\b(?:abs_alt|altitude)\s{{0,3}}:\s{{0,3}}{VALUE}", re.IGNORECASE)
 HEIGHT = re.compile(
-    rf"\b(?:rel_alt|BAROMETER)\s{{0,3}}:\s{{0,3}}{NUMBER}|(?<![\w.])H\s{{1,3}}([-+]?\d{{1,6}}(?:\.\d{{1,6}})?)m", re.I
+    rf"\b(?:rel_alt|BAROMETER)\s{{0,3}}:\s{{0,3}}{VALUE}|(?<![\w.])H\s{{1,3}}([-+]?\d{{1,6}}(?:\.\d{{1,6}})?)m", re.I
 )
-FOCAL = re.compile(rf"\bfocal_len\s{{0,3}}:\s{{0,3}}{NUMBER}", re.IGNORECASE)
+FOCAL = re.compile(rf"\bfocal_len\s{{0,3}}:\s{{0,3}}{VALUE}", re.IGNORECASE)
 DATE = re.compile(r"\b(\d{4})[-.](\d{2})[-.](\d{2})[ T](\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d{1,3}))?")
 SHOWN = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})\s{0,9}-->\s{0,9}(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})")
 MAX_FILE_BYTES = 512 << 20  # an hour at 60 frames a second takes 80 MB
@@ -161,7 +162,7 @@ def _fix(cue: Cue) -> Fix | None:
         latitude,
         longitude,
         _number(ALTITUDE.search(text)),
-        None if height is None else float(height[1] or height[2]),
+        None if height is None else _float(height[1] or height[2]),
         decimals,
         _date(text),
         _focal(_number(FOCAL.search(text))),
@@ -172,7 +173,7 @@ def _degrees(text: str) -> tuple[float, float, int] | None:
     """Latitude, longitude, and how many decimals they have."""
     latitude, longitude = LATITUDE.search(text), LONGITUDE.search(text)
     if latitude is not None and longitude is not None:
-        return float(latitude[1]), float(longitude[1]), max(map(_decimals, (latitude[1], longitude[1])))
+        return _float(latitude[1]), _float(longitude[1]), max(map(_decimals, (latitude[1], longitude[1])))
     found = GPS.search(text)
     if found is None:
         return None
@@ -187,11 +188,15 @@ def _degrees(text: str) -> tuple[float, float, int] | None:
 
 
 def _decimals(number: str) -> int:
-    return len(number.partition(".")[2])
+    return len(number.replace(",", ".").partition(".")[2])
+
+
+def _float(number: str) -> float:
+    return float(number.replace(",", "."))
 
 
 def _number(found: re.Match[str] | None) -> float | None:
-    return None if found is None else float(found[1])
+    return None if found is None else _float(found[1])
 
 
 def _focal(stated: float | None) -> float | None:

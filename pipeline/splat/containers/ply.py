@@ -17,10 +17,19 @@ import torch
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.output_file import new_file
 from splatpipe.pipeline.splat.containers.bounded import check_values, open_file
+from splatpipe.pipeline.splat.containers.ply_dialects import (
+    BYTE_COLOURS,
+    DC,
+    FILTER,
+    SCALE,
+    PlyDialect,
+    convolved,
+    dialect_of,
+)
 from splatpipe.pipeline.splat.containers.ply_header import PLY_HINT, PlyElement, ply_header_bytes, read_ply_header
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.scene import NO_OFFSET
-from splatpipe.pipeline.splat.model.sh import MAX_DEGREE, coefficient_count
+from splatpipe.pipeline.splat.model.sh import C0, MAX_DEGREE, coefficient_count
 
 MIP_COMMENT = "SplatRenderMode: mip"
 """The header comment that tags a model trained with the anti-aliased rasterizer."""
@@ -34,10 +43,8 @@ _INFINITY_LOG_SCALE = -20.0
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
-_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-_REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROTATION)
+_REQUIRED = (*_POSITION, *DC, "opacity", *SCALE, *_ROTATION)
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,7 @@ class SplatHeader:
         comments: The comment lines' texts, in order.
         row: numpy's structured type of one vertex, in the file's byte order.
         offset_bytes: Where the vertices begin.
+        dialect: How its properties differ from those of 3DGS.
     """
 
     count: int
@@ -57,6 +65,7 @@ class SplatHeader:
     comments: tuple[str, ...]
     row: np.dtype[np.void]
     offset_bytes: int
+    dialect: PlyDialect
 
 
 def write_splat(
@@ -146,7 +155,7 @@ def _write_rows(file: BinaryIO, gaussians: Gaussians, offset: tuple[float, float
 def property_names(sh_degree: int) -> list[str]:
     """The vertex's properties in the order of the 3DGS layout."""
     rest = [f"f_rest_{i}" for i in range(3 * (coefficient_count(sh_degree) - 1))]
-    return [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
+    return [*_POSITION, *_NORMAL, *DC, *rest, "opacity", *SCALE, *_ROTATION]
 
 
 def read_splat(path: Path) -> Gaussians:
@@ -182,7 +191,7 @@ def read_stored_splat(path: Path) -> tuple[Gaussians, SplatHeader]:
             gaussians.means = torch.zeros(header.count, 3, dtype=torch.float64)
         start = 0
         for rows in _chunks(path, file, header):
-            _fill(gaussians, start, rows)
+            _fill(gaussians, start, rows, header.dialect)
             start += len(rows)
     return gaussians, header
 
@@ -203,21 +212,24 @@ def _read_header(path: Path, file: BinaryIO) -> SplatHeader:
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
         raise SplatpipeError(f"{path} has no vertices.", hint=PLY_HINT)
-    degree = _check_vertex(path, vertex, has_chunks=any(e.name == "chunk" for e in header.elements))
+    dialect = dialect_of(dict(vertex.fields))
+    degree = _check_vertex(path, vertex, dialect, has_chunks=any(e.name == "chunk" for e in header.elements))
     offset = header.offset_of(path, vertex)
-    return SplatHeader(vertex.count, degree, header.comments, header.row_of(vertex), offset)
+    return SplatHeader(vertex.count, degree, header.comments, header.row_of(vertex), offset, dialect)
 
 
-def _check_vertex(path: Path, vertex: PlyElement, has_chunks: bool) -> int:
+def _check_vertex(path: Path, vertex: PlyElement, dialect: PlyDialect, has_chunks: bool) -> int:
     """Check that a vertex element is a splat's; returns its SH degree."""
     kinds = dict(vertex.fields)
     if has_chunks and "packed_position" in kinds:
         raise SplatpipeError(
             f"{path} is a compressed PLY.", hint="Convert it to a plain PLY first: splatpipe convert IN OUT.ply."
         )
-    missing = [name for name in _REQUIRED if name not in kinds]
+    required = [name for name in _REQUIRED if name not in dialect.replaced]
+    missing = [name for name in required if name not in kinds]
     if missing:
-        what = "a point cloud or a mesh" if "f_dc_0" in missing and "x" not in missing else "incomplete"
+        bare = "f_dc_0" in missing or (dialect.byte_colours and "opacity" in missing)
+        what = "a point cloud or a mesh" if bare and "x" not in missing else "incomplete"
         raise SplatpipeError(f"{path} is not a splat but {what}: it has no {', '.join(missing)}.", hint=PLY_HINT)
     rest = [name for name in kinds if name.startswith("f_rest_")]
     degrees = {3 * (coefficient_count(degree) - 1): degree for degree in range(MAX_DEGREE + 1)}
@@ -226,7 +238,7 @@ def _check_vertex(path: Path, vertex: PlyElement, has_chunks: bool) -> int:
             f"{path}: {len(rest)} f_rest properties are not spherical harmonics of degree 0 to {MAX_DEGREE}.",
             hint=PLY_HINT,
         )
-    if vertex.has_list or any(kinds[name] not in ("f4", "f8") for name in [*_REQUIRED, *rest]):
+    if vertex.has_list or any(kinds[name] not in ("f4", "f8") for name in [*required, *rest]):
         raise SplatpipeError(f"{path}: a splat's properties must be floats.", hint=PLY_HINT)
     return degrees[len(rest)]
 
@@ -244,7 +256,7 @@ def _chunks(path: Path, file: BinaryIO, header: SplatHeader) -> Iterator[np.ndar
         left -= count
 
 
-def _fill(gaussians: Gaussians, start: int, rows: np.ndarray) -> None:
+def _fill(gaussians: Gaussians, start: int, rows: np.ndarray, dialect: PlyDialect) -> None:
     """Convert rows into the Gaussians from ``start`` on."""
     part = slice(start, start + len(rows))
 
@@ -258,12 +270,16 @@ def _fill(gaussians: Gaussians, start: int, rows: np.ndarray) -> None:
     k = gaussians.sh.shape[1]
     rest = columns([f"f_rest_{i}" for i in range(3 * (k - 1))])
     gaussians.means[part] = columns(_POSITION, "f4" if gaussians.means.dtype == torch.float32 else "f8")
-    gaussians.sh[part, 0] = columns(_DC)
+    gaussians.sh[part, 0] = (columns(BYTE_COLOURS) / 255.0 - 0.5) / C0 if dialect.byte_colours else columns(DC)
     gaussians.sh[part, 1:] = rest.reshape(len(rows), 3, k - 1).transpose(1, 2)
     logits = columns(["opacity"])[:, 0]
     infinite = torch.isinf(logits)
-    gaussians.opacity_logits[part] = torch.where(infinite, torch.sign(logits) * _INFINITY_LOGIT, logits)
-    log_scales = columns(_SCALE)
+    logits = torch.where(infinite, torch.sign(logits) * _INFINITY_LOGIT, logits)
+    log_scales = columns([name for name in SCALE if name not in dialect.replaced])
+    if dialect.flat:
+        log_scales = torch.cat([log_scales, torch.full((len(rows), 1), _INFINITY_LOG_SCALE)], dim=1)
     log_scales[log_scales == -torch.inf] = _INFINITY_LOG_SCALE
-    gaussians.log_scales[part] = log_scales
+    if dialect.filtered:
+        log_scales, logits = convolved(log_scales, logits, columns([FILTER])[:, 0])
+    gaussians.log_scales[part], gaussians.opacity_logits[part] = log_scales, logits
     gaussians.quats[part] = columns(_ROTATION)

@@ -17,6 +17,8 @@ from splatpipe.pipeline.splat.model.scene import Scene
 _ROWS_AT_ONCE = 1 << 16
 _MAX_HEADER_BYTES = 65_536  # bytes of a PLY read for its header, which says whether it is compressed
 _MAGIC = ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"PK", "sog"), (b"glTF", "glb"))
+_OTHERS = (".splat", ".ksplat", ".rad", ".lcc", ".ckpt", ".pth", ".pt")
+_OTHERS_HINT = "Save it as PLY: with SuperSplat or splat-transform; of a trainer's checkpoint, with the trainer."
 _HINT = "Give a splat as PLY, compressed PLY, SPZ, SOG or GLB, or the folder of a 3DGS model."
 
 
@@ -53,6 +55,8 @@ def format_of_content(path: Path) -> SplatFormat:
     else:
         name = _name_of_file(path)
     found = next((each for each in SPLAT_FORMATS if each.name == name and each.reads), None)
+    if found is None and path.suffix.lower() in _OTHERS:
+        raise SplatpipeError(f"{path}: {path.suffix} files are not read.", hint=_OTHERS_HINT)
     if found is None:
         raise SplatpipeError(f"{path} is not a readable splat.", hint=_HINT)
     return found

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.splat.containers.bounded import CheckValues, check_values
 from splatpipe.pipeline.splat.containers.ply import MIP_COMMENT, read_stored_splat, write_splat
+from splatpipe.pipeline.splat.containers.ply_dialects import stored_activated, take_logarithms
 from splatpipe.pipeline.splat.formats.near_origin import scene_near_origin
 from splatpipe.pipeline.splat.model.position_cost import PositionCost, float32_cost
 from splatpipe.pipeline.splat.model.scene import NO_OFFSET, Axes, Scene, SceneFacts, facts_of_record
@@ -114,9 +115,13 @@ def read(path: Path, check: CheckValues = check_values) -> Scene:
         SplatpipeError: as ``read_splat``.
     """
     gaussians, header = read_stored_splat(path)
+    notes = header.dialect.notes(path)
+    if stored_activated(gaussians):
+        take_logarithms(gaussians)
+        notes += (f"{path} has opacities and scales as they are, not as logits and logarithms: they are read as such.",)
     check(path, gaussians)
     scene = scene_near_origin(path, gaussians, facts_of_comments(header.comments))
-    return replace(scene, notes=scene.notes + _others_offsets(path, header.comments))
+    return replace(scene, notes=notes + scene.notes + _others_offsets(path, header.comments))
 
 
 def _others_offsets(path: Path, comments: Sequence[str]) -> tuple[str, ...]:

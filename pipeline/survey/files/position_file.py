@@ -15,10 +15,14 @@ from pathlib import Path, PurePosixPath
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.photos.files.names import NameFinder, is_photo
 from splatpipe.pipeline.survey.files.survey_text import (
+    EAST,
     ELLIPSOIDAL_Z,
     GEOGRAPHIC,
     GEOGRAPHIC_Y,
+    HEIGHT,
     MAX_NAME_WORDS,
+    NORTH,
+    PHOTO,
     SEPARATORS,
     UNKNOWN,
     LineError,
@@ -44,13 +48,13 @@ SIGMA_BOUNDS_M = (1e-4, 1e4)
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "name": (
         *("name", "image", "image_name", "imagename", "photo", "photo_name", "filename", "file_name", "file", "label"),
-        *("sourcefile", "picture"),
+        *("sourcefile", "picture", *PHOTO),
     ),
-    "x": ("x", "geo_x", "east", "easting", "e", "x/easting", "x/east", *GEOGRAPHIC),
-    "y": ("y", "geo_y", "north", "northing", "n", "y/northing", "y/north", *GEOGRAPHIC_Y),
+    "x": ("x", "geo_x", "east", "easting", "e", "x/easting", "x/east", *EAST, *GEOGRAPHIC),
+    "y": ("y", "geo_y", "north", "northing", "n", "y/northing", "y/north", *NORTH, *GEOGRAPHIC_Y),
     "z": (
         *("z", "geo_z", "height", "h", "alt", "altitude", "elevation", "elev", "gpsaltitude", "gps_altitude"),
-        *("z/altitude", "z/height", "altitude_m", "height_m", *ELLIPSOIDAL_Z),
+        *("z/altitude", "z/height", "altitude_m", "height_m", *HEIGHT, *ELLIPSOIDAL_Z),
     ),
     "yaw": ("yaw", "yaw_deg", "heading"),
     "pitch": ("pitch", "pitch_deg"),
@@ -229,5 +233,6 @@ def _require_once(photos: Sequence[PhotoPlace]) -> None:
     lines: dict[str, int] = {}
     for photo in photos:
         if photo.name in lines:
-            raise LineError(photo.line, f"{photo.name[:80]} was in line {lines[photo.name]} already")
+            text = f"{photo.name[:80]} was in line {lines[photo.name]} already"
+            raise LineError(photo.line, text, "A photo has one position: remove the other lines.")
         lines[photo.name] = photo.line

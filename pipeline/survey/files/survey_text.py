@@ -25,14 +25,25 @@ CRS_COMMENT = re.compile(r"#\s*(?:crs|srs|epsg|coordinate[ _]?system)\s*[:=]\s*(
 AUTHORITY = re.compile(r'\bEPSG(?:::?\s*|"\s*,\s*")(\d{4,6})\b', re.IGNORECASE)
 SEPARATOR_LINE = re.compile(r'"?sep=.?"?', re.IGNORECASE)  # the first line that a spreadsheet writes
 UNITS = re.compile(r"[ _]*[(\[][^)\]]*[)\]]$")  # after a title
+# titles in German, French, Italian and Spanish
+EAST = ("rechtswert", "ostwert", "est", "este")
+NORTH = ("hochwert", "nordwert", "nord", "norte")
+HEIGHT = ("höhe", "hoehe", "altura", "quota", "cota")
+PHOTO = ("bild", "bildname", "foto", "imagen", "immagine")
 GEOGRAPHIC = ("lon", "lng", "long", "longitude", "gpslongitude", "gps_longitude", "x/longitude", "longitude_deg")
 GEOGRAPHIC_Y = ("lat", "latitude", "gpslatitude", "gps_latitude", "y/latitude", "latitude_deg")
 ELLIPSOIDAL_Z = ("ellipsoidal_height", "ellipsoid_height")
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "": "blanks"}
 MAX_NAME_WORDS = 20  # words of a photo's name in a list whose fields blanks separate
 SAMPLE_LINES = 20  # lines of a list without a header, by which its separator is found
+QUOTED, QUOTED_FIELD = re.compile(r'^"([^"]*)"$'), re.compile(r'(?:^|\s)"[^"]*"(?:\s|$)')
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 CODE = re.compile(r"EPSG\s*:|\+|WGS\s?84\s*/?\s*UTM", re.IGNORECASE)  # how a CRS begins that splatpipe knows by itself
+MAX_FOREIGN_SHARE = 0.05  # of letters beyond ASCII in a table of one of Windows' code pages, which none of them names
+MISWRITTEN = (  # what a number may have been meant to be, and how to write it
+    (re.compile("[°º]|[0-9] *[NSEW]$"), "Write degrees with decimals, negative in the south and west: 13.512690."),
+    (re.compile("^[0-9]{1,3}(?:['’,. ][0-9]{3})+"), "Write numbers without signs between thousands: 388710.51."),
+)
 CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 
 
@@ -69,8 +80,7 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
     """
     name = f"The {kind.what} {path.name}"
     try:
-        data = read_small(path, kind.max_bytes)
-        text = data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
+        text = _text_of(read_small(path, kind.max_bytes))
     except UnicodeDecodeError as error:
         raise SplatpipeError(f"{name} is not UTF-8 text.", "Save it as plain text in UTF-8.") from error
     except OSError as error:
@@ -83,6 +93,23 @@ def read_lines(path: Path, kind: TableKind) -> list[tuple[int, str]]:
         what = f"more than {kind.max_lines:,} lines" if long is None else f"no plain text in line {long}"
         raise SplatpipeError(f"{name} has {what}.", kind.expected)
     return list(enumerate(lines, 1))
+
+
+def _text_of(data: bytes) -> str:
+    """A file's text: UTF-8 or UTF-16, else Windows' western code page, in which spreadsheets save a CSV.
+
+    Raises:
+        UnicodeDecodeError: if it is none of these.
+    """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        foreign = sum(byte > 0x7F for byte in data)
+        if b"\0" in data or foreign > MAX_FOREIGN_SHARE * len(data):
+            raise
+        return data.decode("cp1252")
 
 
 def written_lines(lines: Sequence[tuple[int, str]], path: Path, kind: TableKind) -> list[tuple[int, str]]:
@@ -187,7 +214,12 @@ def list_fields(line: str, separator: str, tabs: int) -> list[str]:
     if separator:
         with contextlib.suppress(csv.Error):
             return [cell.strip() for cell in cells_of(line, separator)]
-    return [field.strip() for field in line.split("\t")] if line.count("\t") >= tabs else line.split()
+    if line.count("\t") >= tabs:
+        return [QUOTED.sub(r"\1", field.strip()) for field in line.split("\t")]
+    if QUOTED_FIELD.search(line):
+        with contextlib.suppress(csv.Error):
+            return cells_of(line, " ")
+    return line.split()
 
 
 def with_whole_name(fields: Sequence[str], at: int) -> list[str]:
@@ -234,7 +266,8 @@ def number_in(line: int, what: str, text: str) -> float:
     """
     text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
     if not is_number(text) or abs(float(text)) > MAX_COORDINATE:
-        raise LineError(line, f"{what} is {text[:40]!r}, which is not a valid number")
+        hint = next((hint for form, hint in MISWRITTEN if form.search(text)), "")
+        raise LineError(line, f"{what} is {text[:40]!r}, which is not a valid number", hint)
     return float(text)
 
 

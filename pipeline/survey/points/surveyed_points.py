@@ -10,7 +10,7 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.files.names import NameFinder, list_names, without_zeros
+from splatpipe.pipeline.photos.files.names import NameFinder, hint_of_several, list_names, without_zeros
 from splatpipe.pipeline.photos.files.photo_list import Photo
 from splatpipe.pipeline.survey.crs.crs import Crs
 from splatpipe.pipeline.survey.crs.readings import MIN_EXPLAINED_SHARE
@@ -200,17 +200,23 @@ def _check_photos(name: str, file: ControlFile, photos: Mapping[str, Photo], rep
     missing = [photo for photo in named if find(photo) is None]
     if not missing:
         return
-    eaten = eaten_zeros(missing, photos)
+    known = name_hint(missing, photos)
     if len(missing) == len(named):
         raise SplatpipeError(
-            f"None of the photos that {name} names is in this capture: {list_names(missing)}.",
-            (eaten or "Check that the file belongs to these photos; photos must be listed by their file names.")
+            f"None of the photos that {name} names can be found in this capture: {list_names(missing)}.",
+            (known or "Check that the file belongs to these photos; photos must be listed by their file names.")
             + " --set georef.control=none runs without control.",
         )
     report.warning(
         f"{name} names {missing_photos(missing)}.",
-        f"Their marks are ignored. {eaten or 'Correct the names, or add the photos.'}",
+        f"Their marks are ignored. {known or 'Correct the names, or add the photos.'}",
     )
+
+
+def name_hint(missing: Sequence[str], photos: Iterable[str]) -> str:
+    """What appears to be wrong with names of photos that are not found; empty if nothing is known."""
+    known = sorted(photos)
+    return hint_of_several(missing, known) or eaten_zeros(missing, known)
 
 
 def eaten_zeros(missing: Sequence[str], known: Iterable[str], what: str = "photos") -> str:
@@ -229,7 +235,7 @@ def eaten_zeros(missing: Sequence[str], known: Iterable[str], what: str = "photo
 def missing_photos(names: Sequence[str]) -> str:
     """Phrase for messages about photos that a file names and the capture does not have."""
     many = "1 photo that is" if len(names) == 1 else f"{len(names)} photos that are"
-    return f"{many} not in this capture: {list_names(names)}"
+    return f"{many} not found in this capture: {list_names(names)}"
 
 
 def _report_overruled_roles(points: Sequence[SurveyPoint], name: str, setting: str, report: Reporter) -> None:

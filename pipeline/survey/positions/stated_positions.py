@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.photos.files.names import NameFinder, list_names
+from splatpipe.pipeline.photos.files.names import NameFinder, hint_of_several, list_names
 from splatpipe.pipeline.photos.metadata.camera_angles import detect_convention, gimbal_from_nadir
 from splatpipe.pipeline.survey.crs.coordinate_readings import nearer_reading
 from splatpipe.pipeline.survey.crs.crs import parse_crs, to_geodetic
@@ -88,7 +88,8 @@ def read_places(
     if not matched:
         raise SplatpipeError(
             f"{path.name} lists no photo of this capture: {list_names(unknown)}.",
-            "It may belong to another capture: give the right one with --set ingest.positions=PATH, or =none to "
+            hint_of_several(unknown, names)
+            or "It may belong to another capture: give the right one with --set ingest.positions=PATH, or =none to "
             "ignore it.",
         )
     crs = parse_crs(file.crs)

@@ -23,7 +23,9 @@ from splatpipe.pipeline.film.video import VideoWriter
 from splatpipe.pipeline.photos.files.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.metadata.exif import read_exif
 from splatpipe.pipeline.photos.options import IngestConfig
+from splatpipe.pipeline.photos.video import frames, measuring
 from splatpipe.pipeline.photos.video.frames import extract_frames
+from splatpipe.pipeline.photos.video.motion import FilmMeter
 from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
@@ -91,6 +93,62 @@ def test_a_second_run_does_nothing_and_a_changed_film_or_subtitle_runs_again(flo
     request = Request(LINE, LineConfig(), film, tmp_path / "out", Machine())
     line, _ = status_of(request)
     assert line.photos_dir == film
+
+
+def test_a_killed_ingest_of_a_film_goes_on(flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = ingested(flown / "flight.mp4", tmp_path / "whole", [])
+    monkeypatch.setattr(measuring, "KEEP_S", -1.0)
+    measured: list[int] = []
+    saved: list[str] = []
+    add, save = FilmMeter.add, frames._save
+
+    def add_or_die(meter: FilmMeter, number: int, time_s: float, pixels: np.ndarray) -> None:
+        measured.append(number)
+        if len(measured) == 20:
+            raise KeyboardInterrupt
+        add(meter, number, time_s, pixels)
+
+    def save_or_die(pixels: np.ndarray, frame: frames._Frame, folder: Path) -> None:
+        saved.append(frame.name)
+        if len(saved) == 3:
+            raise KeyboardInterrupt
+        save(pixels, frame, folder)
+
+    monkeypatch.setattr(FilmMeter, "add", add_or_die)
+    monkeypatch.setattr(frames, "_save", save_or_die)
+    film, kept, config = flown / "flight.mp4", tmp_path / "kept", IngestConfig()
+    quiet = EventReporter("x", lambda _event: None)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            extract_frames(film, tmp_path / "frames", config, 1, quiet, kept)
+    left = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "frames").iterdir()}
+    assert len(left) == 2
+    (tmp_path / "frames" / "stray.jpg").touch()
+    extract_frames(film, tmp_path / "frames", config, 1, quiet, kept)
+    assert sorted(set(measured)) == list(range(0, COUNT, 2)) and len(measured) == COUNT // 2 + 1
+    again = {path.name: path for path in (tmp_path / "frames").iterdir()}
+    assert all(again[name].stat().st_mtime_ns == time for name, time in left.items())
+    expected = {path.name: path.read_bytes() for path in (whole / "photos" / "frames").iterdir()}
+    assert {name: path.read_bytes() for name, path in again.items()} == expected
+
+
+def test_what_a_killed_ingest_left_is_no_part_of_the_artifact(flown: Path, tmp_path: Path) -> None:
+    request = Request(LINE, LineConfig(), flown / "flight.mp4", tmp_path / "out", Machine(threads=2))
+    with open_session(request, lambda _event: None) as runner:
+        whole = runner.walk(until="ingest").artifacts["ingest"].folder
+    files = {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*.jp*g")}
+    partial = tmp_path / "out" / "stages" / ".partial" / whole.name
+    shutil.move(whole, partial)
+    (partial / "manifest.json").unlink()
+    (partial / "film.measures").write_bytes(b"broken")
+    (partial / "photos" / "masks").mkdir()
+    for stray in ("photos/masks/x.png", "photos/stray", "photos/frames/flight_999999.jpg"):
+        (partial / stray).touch()
+    with open_session(request, lambda _event: None) as runner:
+        again = runner.walk(until="ingest").artifacts["ingest"].folder
+    assert {path.relative_to(again): path.read_bytes() for path in again.rglob("*.jp*g")} == files
+    assert not (again / "photos" / "masks").exists() and not (again / "photos" / "stray").exists()
+    assert not (again / "film.measures").exists()
 
 
 def test_check_reads_a_film_and_tells_of_it(flown: Path, tmp_path: Path) -> None:

@@ -389,7 +389,7 @@ def test_file_of_other_photos_is_refused_and_some_missing_ones_are_named(
     assert "listed by their file names" in caught.value.hint
     some = [replace(row, photo="GONE.JPG") if row.photo == "DJI_0020.JPG" else row for row in rows(FIVE)]
     result = georef(tmp_path / "b", whole, gcp_list(some))
-    assert [w for w in result.notes.warnings if "1 photo that is not in this capture: GONE.JPG" in w]
+    assert [w for w in result.notes.warnings if "1 photo that is not found in this capture: GONE.JPG" in w]
     assert result.table("control")["count"] == 5
 
 

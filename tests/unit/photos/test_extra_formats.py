@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Self
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -136,3 +137,10 @@ def test_other_formats_of_a_photo_are_left_out_whatever_is_installed(tmp_path: P
     scan = scan_folder(tmp_path)
     assert [candidate.name for candidate in scan.candidates] == ["a.JPG", "b.HEIC"]
     assert {(entry.name, entry.kind) for entry in scan.left_out} == {("a.DNG", "companion"), ("b.DNG", "companion")}
+
+
+def test_a_colour_tiff_of_floats_is_not_only_called_damaged(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "reflectance.tif"), np.full((400, 500, 3), 0.5, np.float32))
+    [candidate] = scan_folder(tmp_path).candidates
+    left_out = check_photo(candidate, LIMITS)
+    assert isinstance(left_out, ExcludedPhoto) and "8 or 16 bits for each colour" in left_out.reason

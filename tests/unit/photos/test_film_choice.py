@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from splatpipe.pipeline.photos.video.choice import choose, overlaps_with
-from splatpipe.pipeline.photos.video.motion import MAX_LOST_FRAMES, Measures, joined, measure, motion, sharpness
+from splatpipe.pipeline.photos.video.motion import MAX_LOST_FRAMES, FilmMeter, Measures, motion, sharpness
 
 FPS = 15.0
 
@@ -26,8 +26,11 @@ def textured(seed: int = 0, size: tuple[int, int] = (900, 1600)) -> np.ndarray:
     return np.asarray(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), None, 0, 255, cv2.NORM_MINMAX), np.uint8)
 
 
-def frames_of(pictures: list[np.ndarray]) -> list[tuple[int, float, np.ndarray]]:
-    return [(k, k / FPS, cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)) for k, picture in enumerate(pictures)]
+def measured(pictures: list[np.ndarray]) -> Measures:
+    meter = FilmMeter()
+    for k, picture in enumerate(pictures):
+        meter.add(k, k / FPS, cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+    return meter.measures()
 
 
 def test_frames_of_a_steady_flight_overlap_by_70_to_80_percent() -> None:
@@ -107,9 +110,9 @@ def test_blur_in_any_direction_is_less_sharp(kernel: tuple[int, int]) -> None:
 def test_a_flash_is_no_cut_and_another_scene_is_one() -> None:
     picture, other, white = textured(), textured(1), np.full((540, 960), 255, np.uint8)
     pan = [picture[100:640, 5 * k : 5 * k + 960] for k in range(20)]
-    flash = joined(measure(frames_of([*pan[:10], white, *pan[11:]])))
+    flash = measured([*pan[:10], white, *pan[11:]])
     assert np.isnan(flash.steps[:, 0, 0]).sum() == 1 and flash.sharpness[10] == 0.0
     assert np.prod([step[0, 0] for step in flash.steps[1:]]) == pytest.approx(1.0, abs=0.02)
     assert flash.steps[1:, 0, 2].sum() * 960 == pytest.approx(-95.0, abs=2.0)
     scenes = [*pan, *(other[100:640, 5 * k : 5 * k + 960] for k in range(MAX_LOST_FRAMES + 10))]
-    assert np.isnan(joined(measure(frames_of(scenes))).steps[:, 0, 0]).sum() == 2
+    assert np.isnan(measured(scenes).steps[:, 0, 0]).sum() == 2

@@ -2,6 +2,7 @@
 
 import datetime
 import random
+import re
 import time
 from pathlib import Path
 
@@ -56,6 +57,7 @@ def fixes(path: Path, text: str, near: tuple[float, float] | None = None) -> lis
         (MINI, 547.213, 32.1),
         (MINI.replace("\n", "\r\n"), 547.213, 32.1),
         ("\ufeff" + MINI, 547.213, 32.1),
+        (re.sub(r"(: -?\d+)\.", r"\1,", MINI), 547.213, 32.1),
         (MAVIC_2, 547.213, None),
         (MAVIC_PRO, None, 32.1),
         (MAVIC_MINI, None, 32.1),

@@ -197,3 +197,13 @@ def test_a_line_that_cannot_be_read_names_the_separator_and_the_columns(tmp_path
 )
 def test_points_without_names_are_called_by_their_number(kind: str, name: str, said: str) -> None:
     assert titled(kind, name) == said
+
+
+def test_a_german_spreadsheets_table_is_read(tmp_path: Path) -> None:
+    lines = ["sep=;", "EPSG:25832;;;;;;", "Punkt;Rechtswert;Hochwert;Höhe;Bild;Pixel X;Pixel Y;"]
+    lines += ["P1;388710,51;5299705,21;512,01;Münster_1.JPG;112,1;514,1;"]
+    path = tmp_path / "control.csv"
+    path.write_bytes("\r\n".join(lines).encode("cp1252"))
+    [point] = read_control_file(path).points
+    assert (point.name, point.x, point.y, point.z) == ("P1", 388710.51, 5299705.21, 512.01)
+    assert [(mark.photo, mark.x, mark.y) for mark in point.marks] == [("Münster_1.JPG", 112.1, 514.1)]

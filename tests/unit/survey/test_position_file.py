@@ -176,3 +176,25 @@ def test_what_cannot_be_read_names_the_separator_the_columns_and_an_example(tmp_
     ) as caught:
         read(tmp_path, "EPSG:4326\na.jpg|13.5|47.8\n")
     assert "DJI_0001.JPG 13.5127 47.8412 512.3" in caught.value.hint
+
+
+def test_names_in_quotes_between_blanks_and_a_photo_with_two_positions(tmp_path: Path) -> None:
+    path = tmp_path / "geo.txt"
+    path.write_text('EPSG:4326\n"DJI_0001.JPG" 13.5 47.8 512\n"DJI 0002.JPG" 13.6 47.9 513\n')
+    assert [photo.name for photo in read_position_file(path).photos] == ["DJI_0001.JPG", "DJI 0002.JPG"]
+    path.write_text("EPSG:4326\nDJI_0001.JPG 13.5 47.8 512\nDJI_0001.JPG 13.6 47.9 513\n")
+    with pytest.raises(SplatpipeError, match=r"Line 3 of geo\.txt: DJI_0001\.JPG was in line 2 already") as caught:
+        read_position_file(path)
+    assert "one position" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("number", "way"),
+    [("13°30'46.8\"E", "degrees with decimals"), ("13 30 46 E", "degrees with decimals"), ("388'710.51", "thousands")],
+)
+def test_a_number_in_another_notation_is_refused_with_the_right_one(tmp_path: Path, number: str, way: str) -> None:
+    path = tmp_path / "positions.csv"
+    path.write_text(f"name;longitude;latitude\nDJI_0001.JPG;{number};47.8\n")
+    with pytest.raises(SplatpipeError, match="not a valid number") as caught:
+        read_position_file(path)
+    assert way in caught.value.hint
