@@ -294,7 +294,7 @@ DSM = Stage(
 )
 DTM = Stage(
     "dtm",
-    version=1,
+    version=2,
     config=DtmConfig,
     reads=("dsm.files", "dsm.site", "georef.frame"),
     parts={"files": "files", "cover": "cover"},
@@ -334,7 +334,7 @@ CLOUD = Stage(
 )
 MESH = Stage(
     "mesh",
-    version=3,
+    version=4,
     config=MeshConfig,
     reads=("dsm.site", *SURFACE_READS),
     parts={"files": "files", "textured": "textured.npz"},

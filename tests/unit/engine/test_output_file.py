@@ -38,6 +38,7 @@ ALLOWED = {
     "pipeline/surface/rasters/geotiff.py": "GDAL, in the new folder of whole_file",
     "pipeline/surface/levels/mbtiles.py": "SQLite, in the new folder of whole_file",
     # In a stage's working folder, which is new, or in which open_store found no link:
+    "pipeline/surface/levels/mesh_texture.py": "decoded pages, in a new temporary folder",
     "pipeline/sfm/mapping/completion.py": "COLMAP's database",
     "pipeline/sfm/matching/keypoints.py": "COLMAP's database",
     "pipeline/sfm/recovery/ladder_growth.py": "COLMAP's database",
