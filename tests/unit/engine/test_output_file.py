@@ -61,7 +61,6 @@ ALLOWED = {
     "pipeline/app/node/tasks/jobs.py": "hard links and copies of uploads and artifacts, in new folders",
     "pipeline/app/node/tasks/uploads.py": "hard links of equal uploads, under unpredictable names",
     "pipeline/app/node/page/gate.py": "the page's secret, as a new file for this user only",
-    "pipeline/app/node/page/check_process.py": "the kernel's file of its own process",
     "pipeline/app/node/assets/rasters.py": "GDAL, in the new folder of whole_file",
     "pipeline/app/node/assets/archive.py": "an entry of an archive that is open",
     # Never installed:
