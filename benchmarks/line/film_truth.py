@@ -41,6 +41,7 @@ RADIUS_M, LOW_M, HIGH_M, TARGET_M = 24.0, 7.0, 14.0, (0.0, 0.0, 2.5)
 RELATIVE_FOCAL = 0.72  # focal length over the image width
 RECEIVER_M = 1.0  # standard deviation of the SRT's positions
 GAMMA = 2.2
+LINEAR = (np.arange(256, dtype=np.float32) / 255.0) ** GAMMA  # light of an 8-bit value
 BANDS = 18  # bands of rows that are exposed at different moments under a rolling shutter
 MAX_TIMES, MAX_LOSS_DB = 2.0, 1.0
 
@@ -101,11 +102,11 @@ def frame_of(flight: Flight, gaussians: Gaussians, options: RenderOptions, time_
     rows = []
     for top, bottom in pairwise(edges):
         late_s = flight.readout_s * ((top + bottom) / 2.0 / flight.height - 0.5)
-        linear = np.zeros((bottom - top, flight.width, 3))
+        linear = np.zeros((bottom - top, flight.width, 3), np.float32)
         for moment in range(flight.moments):
             at_s = time_s + late_s + flight.exposure_s * ((moment + 0.5) / flight.moments - 0.5)
             camera = flight.camera(at_s).crop(0, int(top), flight.width, int(bottom - top))
-            linear += (render_pixels((gaussians, None), camera, options) / 255.0) ** GAMMA
+            linear += LINEAR[render_pixels((gaussians, None), camera, options)]
         rows.append(linear / flight.moments)
     return np.rint(255.0 * np.concatenate(rows) ** (1.0 / GAMMA)).astype(np.uint8)
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import re
-import signal
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from announced import announced
 from playwright.sync_api import Locator, Page
-from timeouts import TIMEOUT_S
 
 PAGE = re.compile(r"Page: (http://127\.0\.0\.1:\d+)/\?key=(\w+)")
 
@@ -35,25 +33,8 @@ class StartedNode:
 @contextlib.contextmanager
 def started(folder: Path, *options: object) -> Iterator[StartedNode]:
     """Run ``splatpipe start FOLDER`` while the context lasts."""
-    command = [sys.executable, "-m", "splatpipe.pipeline.app.cli.main", "start", str(folder), "--no-browser"]
-    command += map(str, options)
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    try:
-        assert process.stderr is not None
-        output = ""
-        for line in process.stderr:
-            output += line
-            if found := PAGE.search(line):
-                yield StartedNode(found.group(1), found.group(0).removeprefix("Page: "), process)
-                break
-        else:
-            raise AssertionError(output)
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=TIMEOUT_S)
-        finally:
-            process.kill()  # no effect if it has ended
+    with announced(PAGE, "start", folder, "--no-browser", *options) as (found, process):
+        yield StartedNode(found.group(1), found.group(0).removeprefix("Page: "), process)
 
 
 def drop(page: Page, onto: Locator, paths: Sequence[Path]) -> None:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from announced import announced
 from timeouts import TIMEOUT_S
 
 OPEN = re.compile(r"Open http://127\.0\.0\.1:(\d+)/(\w*)\?key=(\w+)")
@@ -140,30 +139,6 @@ def reserved_port() -> int:
 @contextlib.contextmanager
 def serving(out: Path, *options: object, environment: Mapping[str, str] | None = None) -> Iterator[Served]:
     """Run ``splatpipe view OUT`` while the context lasts, with some more environment variables."""
-    command = [
-        sys.executable,
-        "-m",
-        "splatpipe.pipeline.app.cli.main",
-        "view",
-        str(out),
-        "--no-browser",
-        *map(str, options),
-    ]
-    env = {**os.environ, **(environment or {})}
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
-    try:
-        assert process.stderr is not None
-        output = ""
-        for line in process.stderr:
-            output += line
-            if found := OPEN.search(line):
-                yield Served(int(found.group(1)), found.group(2), found.group(3), process)
-                break
-        else:
-            raise AssertionError(output)
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=TIMEOUT_S)
-        finally:
-            process.kill()  # no effect if it has ended
+    arguments = ("view", out, "--no-browser", *options)
+    with announced(OPEN, *arguments, environment=environment) as (found, process):
+        yield Served(int(found.group(1)), found.group(2), found.group(3), process)

@@ -39,7 +39,7 @@ from splatpipe.pipeline.surface.rasters.tiles import Tile
 
 NODATA_HEIGHT = -9999.0
 HEIGHT_STEPS_PER_UNIT = 1024.0  # a power of two, so that steps have few bits and compress well
-CACHE_MEGABYTES = 128  # for GDAL's blocks; the default is a share of the machine's memory
+CACHE_BYTES = 128 << 20  # for GDAL's blocks; the default is a share of the machine's memory
 JPEG_QUALITY = 92
 GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)  # the last if a GDAL copy fails without a message
 
@@ -163,7 +163,7 @@ def gdal(scratch: Path) -> rasterio.Env:
     """
     return rasterio.Env(
         CPL_TMPDIR=str(scratch),
-        GDAL_CACHEMAX=CACHE_MEGABYTES,
+        GDAL_CACHEMAX=CACHE_BYTES,
         GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR",
         GDAL_NUM_THREADS="1",
         GDAL_PAM_ENABLED="NO",

@@ -5,8 +5,7 @@ from __future__ import annotations
 import io
 import math
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from rasterio.windows import Window
 from splatpipe.pipeline.surface.rasters.geotiff import GDAL_ERRORS, gdal, open_raster
 
 MAX_PICTURE_PIXELS = 24_000_000  # of a PNG: 100 MB at most; WebODM draws its map from the GeoTIFF
-CACHE_BYTES = 64 << 20  # of GDAL's blocks: rows of a tiled raster need those of a whole row of tiles
 PROBE_SIDE = 64  # pixels of the small view that is read from the overviews
 STRIP_ROWS = 256
 PNG_LEVEL = 3  # a third of the time of the usual 6, for a tenth more bytes
@@ -49,7 +47,7 @@ def check_raster(path: Path, *, colours: bool) -> None:
         UnusableRaster: if it cannot be read, has no alpha band, or not the layout of a COG.
     """
     try:
-        with _gdal(path.parent), open_raster(path) as raster:
+        with gdal(path.parent), open_raster(path) as raster:
             if colours and (raster.colorinterp != RGBA or set(raster.dtypes) != {"uint8"}):
                 raise UnusableRaster("it is not RGBA of 8 bits")
             if raster.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") != "COG":
@@ -61,13 +59,6 @@ def check_raster(path: Path, *, colours: bool) -> None:
                 raise UnplacedRaster("it has no place on the earth")
     except GDAL_ERRORS as error:
         raise UnusableRaster(f"it cannot be read: {error}") from error
-
-
-@contextmanager
-def _gdal(scratch: Path) -> Iterator[None]:
-    """GDAL's environment, with a cache in bytes, as rasterio takes it."""
-    with gdal(scratch), rasterio.Env(GDAL_CACHEMAX=CACHE_BYTES):
-        yield
 
 
 def check_map_tiles(path: Path) -> None:
@@ -118,7 +109,7 @@ def write_picture(source: Path, target: Path) -> tuple[int, int]:
     """
     whole = target.with_suffix(".tif")
     try:
-        with _gdal(target.parent), open_raster(source) as raster:
+        with gdal(target.parent), open_raster(source) as raster:
             height, width = reduced_shape(raster, MAX_PICTURE_PIXELS)
             if (height, width) == raster.shape:
                 copy_raster(raster, target, driver="PNG", ZLEVEL=PNG_LEVEL, strict=False)

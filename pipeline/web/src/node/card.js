@@ -191,7 +191,7 @@ export class JobCard {
 
   #progressPanel() {
     const { progress, stage, what, left_s } = this.task;
-    const left = left_s > 0 ? `, about ${roughly(left_s)} left` : "";
+    const left = left_s > 0 ? `, ${roughly(left_s)} left` : "";
     return [
       element("progress", { max: 100, value: progress, "aria-label": `progress of ${this.task.name}` }),
       element("p", {}, `${Math.floor(progress)} %${left}${stage ? ` · ${stage}${what ? `: ${what}` : ""}` : ""}`),

@@ -57,7 +57,7 @@ export class OptionsForm {
     for (const each of forecasts ?? []) {
       const place = this.forecasts.get(each.preset);
       if (!place) continue;
-      place.replaceChildren(`about ${roughly(each.seconds)}, ${size(each.memory_bytes)} of memory, ${size(each.disk_bytes)} of disk`);
+      place.replaceChildren(`${roughly(each.seconds)}, ${size(each.memory_bytes)} of memory, ${size(each.disk_bytes)} of disk`);
       if (each.lacking) place.append(element("strong", { class: "lacking" }, ` It needs ${each.lacking}.`));
     }
   }

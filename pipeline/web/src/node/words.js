@@ -16,10 +16,10 @@ export function roughly(seconds) {
   if (!Number.isFinite(seconds)) return "–";
   if (seconds < 60) return "less than a minute";
   const minutes = Math.round(seconds / 60);
-  if (minutes < 90) return count(minutes, "minute");
+  if (minutes < 90) return `about ${count(minutes, "minute")}`;
   const hours = seconds / 3600;
-  if (hours < 36) return `${hours < 9.5 ? hours.toFixed(1) : hours.toFixed(0)} hours`;
-  return count(Math.round(hours / 24), "day");
+  if (hours < 36) return `about ${hours < 9.5 ? hours.toFixed(1) : hours.toFixed(0)} hours`;
+  return `about ${count(Math.round(hours / 24), "day")}`;
 }
 
 /** A point in time in the reader's own zone. */
