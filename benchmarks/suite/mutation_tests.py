@@ -47,6 +47,7 @@ TEXT_CHECKS = ("test_every_version_matches_the_present_sources", "test_every_nam
 NEAREST = 6  # test files that a mutation meets alone
 TIMEOUT_S = 300  # time limit of a test: a mutation may make a loop endless
 NO_TESTS = 5  # pytest's exit code
+FIRST = ("-x", "--max-worker-restart", "0")  # an endless loop ends its worker, and that is a failure, too
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 COMPARED = {ast.Lt: ">=", ast.GtE: "<", ast.Gt: "<=", ast.LtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
 COMPUTED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
@@ -294,7 +295,7 @@ class Workshop:
             return []
         workers = ["-n", "logical", "--maxprocesses", "8", "--dist", "loadfile", "--no-loadscope-reorder"]
         skipped = ["-m", "not cuda", "-k", " and ".join(f"not {name}" for name in TEXT_CHECKS)]
-        limits = ["-o", f"timeout={TIMEOUT_S}", "-o", "timeout_method=thread", *(["-x"] if first else [])]
+        limits = ["-o", f"timeout={TIMEOUT_S}", "-o", "timeout_method=thread", *(FIRST if first else [])]
         command = [sys.executable, "-m", "pytest", "-q", *workers, *skipped, *limits, *tests]
         done = subprocess.run(
             command, cwd=self.clone, env=self.environment, capture_output=True, text=True, check=False

@@ -105,7 +105,7 @@ def draw_scene(name: str, fault: str, seed: int) -> Scene:
         np.zeros_like(points),
     )
     gsd_m = float(np.median(np.linalg.norm(points[point] - centres[photo], axis=1))) / float(stated.params[0])
-    positions, wrong = _positions(centres, fault, rng)
+    positions, wrong = stated_positions(centres, fault, rng)
     return Scene(rotations, centres, camera, stated, points, intersected(block), positions, wrong, gsd_m)
 
 
@@ -200,7 +200,7 @@ def _drift(count: int, correlation: float, rng: np.random.Generator) -> Float64[
     return errors
 
 
-def _positions(
+def stated_positions(
     centres: Float64[np.ndarray, "n 3"], fault: str, rng: np.random.Generator
 ) -> tuple[StatedPositions, Bool[np.ndarray, " n"]]:
     """The receiver's positions, and which of them have a blunder."""
