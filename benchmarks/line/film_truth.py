@@ -184,7 +184,7 @@ def judged(name: str, out: Path, flight: Flight, seconds: float) -> Row:
         "placed": len(names),
         "rms_mm": 1000.0 * float(np.sqrt((errors**2).mean())),
         "largest_mm": 1000.0 * float(errors.max()),
-        "psnr_cc": json.loads(judged_views[-1].read_text())["psnr_cc"] if judged_views else None,
+        "psnr_cc": json.loads(judged_views[-1].read_text())["mean"]["psnr_cc"] if judged_views else None,
         "seconds": seconds,
     }
 
