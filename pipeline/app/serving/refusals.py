@@ -12,7 +12,8 @@ from collections.abc import Iterable
 
 from starlette.datastructures import Headers
 
-HOSTS = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")  # any port: a tunnel may use a different one
+# Any port: a tunnel may use a different one. A foreign name can resolve to these addresses, but not be them.
+HOSTS = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 FOREIGN = ("cross-site", "same-site")  # values of Sec-Fetch-Site: another site, or another port of this machine
 
 

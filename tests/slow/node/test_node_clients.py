@@ -3,22 +3,30 @@
 import http.client
 import io
 import json
+import sqlite3
 import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from uuid import uuid4
 
+import numpy as np
 import pyodm
 import pytest
 from node_clients import call, form
 from node_stress import CHEAPEST, HOST, SIZE, Node, check_gone, processes_of, small_photos
+from numpy.typing import NDArray
+from PIL import Image
 from pyodm.exceptions import NodeConnectionError, NodeResponseError, TaskFailedError
 from pyodm.types import TaskStatus
 from timeouts import wait_until
 
 from splatpipe.demo import capture_path
+from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.photos.metadata.exif import read_exif
 
 CONTROL = "gcp_list.txt"
 FULL_WIDTH = 1200  # of the demo's photos, whose pixels the control file states
@@ -173,6 +181,94 @@ def test_a_restart_echoes_its_options_and_reuses_results_and_tasks_end_as_client
     assert task.remove()
     with pytest.raises(NodeResponseError):
         task.remove()
+
+
+ORIGIN = (13.5127, 47.8412)  # of the demo: longitude, latitude
+LENS = f"""<?xml version="1.0" encoding="UTF-8"?>
+<calibration>
+  <projection>frame</projection>
+  <width>{SIZE[0]}</width><height>{SIZE[1]}</height>
+  <f>283.8</f><cx>0</cx><cy>0</cy><k1>-0.052</k1>
+</calibration>
+"""
+
+
+def _square(east_deg: float, north_deg: float, half_deg: float) -> str:
+    """GeoJSON of a square about a place, which is given from the demo's origin."""
+    x, y = ORIGIN[0] + east_deg, ORIGIN[1] + north_deg
+    ring = [(x + half_deg * a, y + half_deg * b) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+    return json.dumps({"type": "Polygon", "coordinates": [ring]})
+
+
+def _surveyed(folder: Path, files: list[str]) -> list[str]:
+    """The files, and beside them positions, a lens, a boundary, and a mask over the left half of a photo."""
+    lines = ["EPSG:4326"]
+    for path in (Path(path) for path in files if path.endswith(".JPG")):
+        with Image.open(path) as photo:
+            gps = read_exif(photo).gps
+        assert gps is not None
+        lines.append(f"{path.name} {gps.longitude} {gps.latitude} {gps.altitude_m} 0 0 0 2.5 4.5")
+    mask = Image.new("L", SIZE, 255)
+    mask.paste(0, (0, 0, SIZE[0] // 2, SIZE[1]))
+    mask.save(folder / "DJI_0001_mask.JPG")
+    for name, text in (("geo.txt", "\n".join(lines)), ("lens.xml", LENS), ("boundary.geojson", _square(0, 0, 1e-4))):
+        (folder / name).write_text(text)
+    return [*files, *sorted(map(str, folder.iterdir()))]
+
+
+def _part(node: Node, uuid: str, stage: str, name: str) -> Path:
+    """A file of the newest artifact of a stage in a task's run."""
+    job = json.loads((node.folder / "tasks" / uuid / "task.json").read_text())["job"]
+    artifacts = (node.folder / "jobs" / job / "out" / "stages").glob(f"{stage}-*")
+    return max(artifacts, key=lambda path: path.stat().st_mtime_ns) / name
+
+
+def _keypoints_x(database: Path) -> dict[str, NDArray[np.float32]]:
+    """The columns of each photo's keypoints, pixels."""
+    with closing(sqlite3.connect(database)) as connection:
+        rows = connection.execute("SELECT name, cols, data FROM keypoints JOIN images USING (image_id)").fetchall()
+    return {name: np.frombuffer(data, np.float32).reshape(-1, columns)[:, 0] for name, columns, data in rows}
+
+
+def test_masks_positions_lens_boundary_and_control_work_as_in_a_folder(
+    node: Node, client: pyodm.Node, files: list[str], tmp_path: Path
+) -> None:
+    task = client.create_task(_surveyed(tmp_path, files), CHEAPEST, "surveyed")
+    task.wait_for_completion(interval=0.5)
+    part = partial(_part, node, task.uuid)
+    masked = {photo["name"]: photo["mask"] for photo in read_json(part("ingest", "photos/photos.json"))["photos"]}
+    assert len(masked) == 20 and [name for name, mask in masked.items() if mask] == ["DJI_0001.JPG"]
+    columns = _keypoints_x(part("features", "database.db"))
+    assert len(columns["DJI_0001.JPG"]) > 20 and columns["DJI_0001.JPG"].min() > 0.48 * SIZE[0]
+    assert columns["DJI_0002.JPG"].min() < 0.25 * SIZE[0]
+    positions = read_json(part("ingest", "positions.json"))["positions"]
+    assert len(positions) == 20
+    for each in positions:
+        assert (each["source"], each["sigma_source"], each["sigma_horizontal_m"], each["sigma_vertical_m"]) == (
+            *("file", "file"),
+            *(2.5, 4.5),
+        )
+    (lens,) = read_json(part("ingest", "lenses.json"))["lenses"]
+    assert (lens["source"], lens["params"][0]) == ("lens-file", 283.8)
+    assert len(read_json(part("georef", "control.json"))["points"]) > 3
+    before = _bounded(part, _square(0, 0, 1e-4))
+    assert 0.0 < before["boundary_points"] < 1.0
+
+    other = _square(0, 1e-4, 1e-4)  # as WebODM sends what was drawn on its map: it counts over the file
+    assert task.restart({**CHEAPEST, "boundary": other})
+    task.wait_for_completion(interval=0.5)
+    after = _bounded(part, other)
+    assert after["boundary_m2"] == pytest.approx(before["boundary_m2"], rel=0.01)
+    assert after["boundary_points"] != before["boundary_points"] and "reused" in "\n".join(task.output())
+
+
+def _bounded(part: Callable[[str, str], Path], geojson: str) -> dict[str, float]:
+    """The summary of a run's georeference, whose boundary must be that of GeoJSON."""
+    ((ring,),) = read_json(part("georef", "boundary.json"))["degrees"]
+    (drawn,) = json.loads(geojson)["coordinates"]
+    assert {tuple(np.round(place, 7)) for place in ring} == {tuple(np.round(place, 7)) for place in drawn}
+    summary: dict[str, float] = read_json(part("georef", "manifest.json"))["summary"]
+    return summary
 
 
 def test_a_token_is_asked_for_by_pyodm(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qsl
 
+from anyio import move_on_after
 from starlette.requests import Request
 
 from splatpipe.pipeline.app.node.api.multipart import BadBodyError
@@ -15,6 +16,7 @@ from splatpipe.pipeline.engine.files.json_file import parse_json
 MAX_SMALL_BYTES = 4 << 20  # options with a boundary, urlencoded
 MAX_FIELDS = 32
 MAX_REST_BYTES = 32 << 20  # read of a refused body, so that its client gets to read why
+IGNORED_S = 30.0  # for a body that is not used: strangers send them, and a connection is one of few
 WHOLE = "splatpipe.whole"  # whether a request's body has been read to its end
 
 
@@ -69,10 +71,11 @@ async def drain_rest(request: Request) -> None:
 
 
 async def drain(request: Request, max_bytes: int) -> None:
-    """Read a body that is of no interest, so that its client can read the answer.
+    """Read a body that is of no interest, so that its client can read the answer; one that takes long is left.
 
     Raises:
         BadBodyError: if it has more bytes, or ends too early.
     """
-    async for _ in limited(request, max_bytes):
-        pass
+    with move_on_after(IGNORED_S):
+        async for _ in limited(request, max_bytes):
+            pass

@@ -99,7 +99,7 @@ class Guard:
         headers = Headers(scope=scope)
         if self._local:
             if HOSTS.fullmatch(host) is None:
-                raise RefusedError(421, "This node is for this machine; it answers to 127.0.0.1 and localhost only.")
+                raise RefusedError(421, "This node is for this machine; it answers to 127.0.0.1, [::1] and localhost.")
             if not scope["path"].startswith(SANDBOXED):
                 check_origin(headers)
         if scope["method"] not in METHODS:

@@ -22,9 +22,9 @@ class UploadedFile:
         self._node, self._part, self._limit, self._size = node, part, limit, 0
 
     @staticmethod
-    def begin(node: Node, uuid: str, folders: bool, name: str, _fields: Mapping[str, str]) -> UploadedFile:
+    def begin(node: Node, uuid: str, name: str, _fields: Mapping[str, str]) -> UploadedFile:
         """Begin to receive a file; raises as ``Node.begin_file``."""
-        return UploadedFile(node, node.begin_file(uuid, name, folders=folders), node.limit_of(name))
+        return UploadedFile(node, node.begin_file(uuid, name), node.limit_of(name))
 
     def write(self, data: bytes) -> None:
         """Take the next bytes.

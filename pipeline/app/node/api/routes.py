@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Mapping
+from asyncio import CancelledError
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from anyio import CapacityLimiter, to_thread
+from anyio import CancelScope, CapacityLimiter, to_thread
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -49,12 +50,10 @@ class Api:
 
     Args:
         node: The node.
-        folders: Whether uploaded files keep their folders, for our own page.
     """
 
-    def __init__(self, node: Node, *, folders: bool = False) -> None:
+    def __init__(self, node: Node) -> None:
         self.node = node
-        self._folders = folders
         self._commands = CapacityLimiter(COMMANDS_AT_ONCE)
         self._receiving = 0  # bodies that are received now
 
@@ -126,7 +125,7 @@ class Api:
             form = await self._form(request, MAX_INIT_BYTES, refuse_files)
         else:
             form = Form({name: str(value) for name, value in (await small_body(request)).items()})
-        wanted = _new_task(form.fields, request.headers.get("set-uuid", ""))
+        wanted = await to_thread.run_sync(_new_task, form.fields, request.headers.get("set-uuid", ""))
         task = await to_thread.run_sync(self.node.create, wanted)
         return answer({"uuid": task.uuid})
 
@@ -161,15 +160,15 @@ class Api:
         task = await to_thread.run_sync(self.node.create, NewTask(uuid=set_uuid))
         try:
             if _has_form(request):
-                form = await self._form(request, MAX_TASK_BYTES, self._opener(task.uuid))
+                form = await self._form(request, MAX_TASK_BYTES, self._checking_opener(task.uuid))
             else:
                 form = Form({name: str(value) for name, value in (await small_body(request)).items()})
-            wanted = _new_task(form.fields, "")
+            wanted = await to_thread.run_sync(_new_task, form.fields, "")
             await to_thread.run_sync(self.node.amend, task.uuid, wanted)
             await to_thread.run_sync(self.node.commit, task.uuid)
-        except BaseException:
-            with suppress(UnknownTaskError, OSError):
-                self.node.give_up(task.uuid)
+        except (Exception, CancelledError):
+            with CancelScope(shield=True), suppress(UnknownTaskError, OSError):
+                await to_thread.run_sync(self.node.give_up, task.uuid)
             raise
         return answer({"uuid": task.uuid})
 
@@ -250,7 +249,20 @@ class Api:
         return answer(SUCCESS)
 
     def _opener(self, uuid: str) -> partial[UploadedFile]:
-        return partial(UploadedFile.begin, self.node, uuid, self._folders)
+        return partial(UploadedFile.begin, self.node, uuid)
+
+    def _checking_opener(self, uuid: str) -> Callable[[str, Mapping[str, str]], UploadedFile]:
+        """As ``_opener``; what the fields before the first file ask for is checked before that is received."""
+        begin, checked = self._opener(uuid), False
+
+        def open_file(name: str, fields: Mapping[str, str]) -> UploadedFile:
+            nonlocal checked
+            if not checked:
+                _new_task(fields, "")
+                checked = True
+            return begin(name, fields)
+
+        return open_file
 
     def _require_disk(self, request: Request) -> None:
         """Refuse a body for which there is no disk before it is sent; one of unknown length is seen as it comes."""

@@ -11,11 +11,11 @@ PAGE is where to write the preflight's page; OPTIONS are tables over the presets
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import time
 from collections import Counter
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from splatpipe.pipeline.app.report.facts.wording import plural
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.engine.events import Event
 
 MODULE = "splatpipe.pipeline.app.node.page.check_process"
+SCRATCH = "scratch"  # beside PAGE: frames of a film, gigabytes
 PRESETS = ("preview", "standard", "high")
 TELL_S = 0.3  # between two lines of progress
 MOST_FINDINGS = 60
@@ -50,9 +51,13 @@ def _check(photos: Path, page: Path, threads: int, options: dict[str, Any]) -> d
     from splatpipe.pipeline.engine.events import EventReporter
 
     configs = {preset: Overrides([options]).resolve(load_preset(preset)) for preset in PRESETS}
-    with TemporaryDirectory(prefix="splatpipe-check-") as scratch:
-        preflight = examine_capture(photos, configs, threads, EventReporter("check", _Progress()), Path(scratch))
+    scratch = page.with_name(SCRATCH)  # the node removes it, too: this process may be ended at any time
+    scratch.mkdir()
+    try:
+        preflight = examine_capture(photos, configs, threads, EventReporter("check", _Progress()), scratch)
         write_page(preflight, page)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
     return summary(preflight)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.app.node.page.check_process import MODULE
+from splatpipe.pipeline.app.node.page.check_process import MODULE, SCRATCH
 from splatpipe.pipeline.app.node.tasks.child import Child
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.json_file import json_text, parse_json, read_json
@@ -103,9 +103,7 @@ class Checks:
                 code = child.poll()
                 if code is None and time.monotonic() - child.began_s < TIME_LIMIT_S and folder.parent.is_dir():
                     return
-                if code is None:
-                    child.end()
-                self._running = None
+                self._end_running()
                 with suppress(OSError):  # the disk is full, or the task was removed: the check counts as not made
                     write_durably(folder / RESULT, json_text({"key": upload.key, **_outcome(folder)}))
             while self._waiting and self._running is None:
@@ -122,16 +120,21 @@ class Checks:
         with self._lock:
             self._waiting = deque(each for each in self._waiting if each[0] != uuid)
             if self._running is not None and self._running[0] == uuid:
-                self._running[3].end()
-                self._running = None
+                self._end_running()
 
     def close(self) -> None:
         """End all checks."""
         with self._lock:
             self._waiting.clear()
-            if self._running is not None:
-                self._running[3].end()
-                self._running = None
+            self._end_running()
+
+    def _end_running(self) -> None:
+        """End the running check, if there is one, or take note of its end; nothing is left but its results."""
+        if self._running is not None:
+            _, _, folder, child = self._running
+            child.end()
+            shutil.rmtree(folder / SCRATCH, ignore_errors=True)
+            self._running = None
 
 
 def _last_line(folder: Path) -> dict[str, Any]:

@@ -120,7 +120,7 @@ class OurPages:
         if not (length.isascii() and length.isdigit()):
             raise HTTPException(411, "Content-Length is required.")
         await to_thread.run_sync(self._node.reserve, int(length))
-        file = await to_thread.run_sync(UploadedFile.begin, self._node, uuid, True, name, {})
+        file = await to_thread.run_sync(UploadedFile.begin, self._node, uuid, name, {})
         block = bytearray()
         try:
             async for chunk in limited(request, self._node.limit_of(name)):
@@ -153,7 +153,7 @@ class OurPages:
 
     async def _start(self, request: Request) -> Response:
         task, body = self._uploading(request), await json_of(request)
-        given = _options(body)
+        given = await to_thread.run_sync(_options, body)
         values = {**given.values, **({MARK_FIRST: True} if body.get("pause") is True else {})}
         wanted = NewTask(_name(body), GivenOptions(values, given.dropped), created_ms=task.created_ms)
 
@@ -167,7 +167,8 @@ class OurPages:
 
     async def _again(self, request: Request) -> Response:
         task, body = self._tasks.get(request.path_params["uuid"]), await json_of(request)
-        values = dict(task.options) if body.get("options") is None else dict(_options(body).values)
+        given = None if body.get("options") is None else await to_thread.run_sync(_options, body)
+        values = dict(task.options if given is None else given.values)
         values.pop(MARK_FIRST, None)
         values |= {MARK_FIRST: True} if body.get("pause") is True else {}
 
@@ -257,12 +258,16 @@ def said(status: int, text: str) -> Response:
     return JSONResponse({"error": text}, status)
 
 
-async def _whole_body(request: Request) -> bytes:
-    return b"".join([chunk async for chunk in limited(request, MAX_JSON_BYTES)])
+async def _whole_body(request: Request, max_bytes: int = MAX_JSON_BYTES) -> bytes:
+    return b"".join([chunk async for chunk in limited(request, max_bytes)])
 
 
-async def json_of(request: Request) -> dict[str, Any]:
+async def json_of(request: Request, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
     """The JSON object in a request's body.
+
+    Args:
+        request: The request.
+        max_bytes: The most that its body may have.
 
     Raises:
         HTTPException: if it is none.
@@ -271,7 +276,7 @@ async def json_of(request: Request) -> dict[str, Any]:
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
         raise HTTPException(415, "The request must be JSON.")
     try:
-        found = json.loads(await _whole_body(request))
+        found = json.loads(await _whole_body(request, max_bytes))
     except (ValueError, RecursionError) as error:
         raise HTTPException(400, "The request must be JSON.") from error
     if not isinstance(found, dict):

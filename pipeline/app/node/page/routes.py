@@ -32,6 +32,7 @@ from splatpipe.pipeline.engine.errors import MachineError
 from splatpipe.pipeline.web.measured_page import SITE
 
 MAX_TOKEN_LETTERS = 512
+MAX_ENTER_BYTES = 8 << 10  # strangers send it
 LOOK_S = 0.3
 LIVE = "live/"  # what a run has not finished
 
@@ -90,7 +91,7 @@ class Page:
         return HTMLResponse(text, headers=HTML)
 
     async def _enter(self, request: Request) -> Response:
-        body = await json_of(request)
+        body = await json_of(request, MAX_ENTER_BYTES)
         token = body.get("token")
         if not isinstance(token, str) or len(token) > MAX_TOKEN_LETTERS or not self._access.takes(token):
             return said(403, "This is not the token of this node.")

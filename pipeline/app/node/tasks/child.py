@@ -46,6 +46,7 @@ class Child:
                 start_new_session=True,
             )
         self.began_s = time.monotonic()
+        self._is_gone = False  # from then on, the group's ID may be another's
 
     @property
     def group(self) -> int:
@@ -66,8 +67,8 @@ class Child:
 
     def ask_to_end(self) -> None:
         """Send SIGTERM to the group."""
-        with suppress(ProcessLookupError):
-            os.killpg(self.group, signal.SIGTERM)
+        if not self._is_gone:
+            self._signal(signal.SIGTERM)
 
     def wait_or_kill(self, until_s: float) -> None:
         """Wait for the group's end until a time of ``time.monotonic``; then kill it."""
@@ -77,5 +78,11 @@ class Child:
         self._process.wait()
 
     def _kill_rest(self) -> None:
+        """Kill what is left of the group, once: its ID is free as soon as its last process is gone."""
+        if not self._is_gone:
+            self._is_gone = True
+            self._signal(signal.SIGKILL)
+
+    def _signal(self, number: signal.Signals) -> None:
         with suppress(ProcessLookupError, PermissionError):  # macOS: a group of zombies is not permitted
-            os.killpg(self.group, signal.SIGKILL)
+            os.killpg(self.group, number)

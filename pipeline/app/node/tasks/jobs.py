@@ -245,7 +245,6 @@ def link_files(names: Iterable[str], source: Path, target: Path) -> None:
     target.mkdir(exist_ok=True)
     for name in names:
         if not (target / name).exists():
-            (target / name).parent.mkdir(parents=True, exist_ok=True)
             link_file(source / name, target / name)
 
 

@@ -11,7 +11,6 @@ from splatpipe.pipeline.photos.files.names import is_photo, is_plain
 
 Kind = Literal["photo", "film", "survey", "other"]
 
-MAX_FOLDERS = 4  # above a file
 MAX_NAME_BYTES = 240  # file systems take 255; part files have a longer name
 RAW_SUFFIXES = (".dng", ".heic", ".heif")
 SURVEY_SUFFIXES = (".txt", ".csv", ".geojson", ".xml", ".cam", SUBTITLE_SUFFIX)
@@ -31,22 +30,7 @@ def plain_name(given: str) -> str:
     Raises:
         BadNameError: if it is empty, hidden, too long, or has characters that do not fit into a line of a file.
     """
-    return _checked(given.replace("\\", "/").rpartition("/")[2])
-
-
-def name_with_folders(given: str) -> str:
-    """The name of an uploaded file with its folders, as a relative POSIX path.
-
-    Raises:
-        BadNameError: if one of them is not a name, or there are too many.
-    """
-    parts = given.replace("\\", "/").split("/")
-    if len(parts) > MAX_FOLDERS + 1:
-        raise BadNameError(f"A file lies below more than {MAX_FOLDERS} folders.")
-    return "/".join(map(_checked, parts))
-
-
-def _checked(name: str) -> str:
+    name = given.replace("\\", "/").rpartition("/")[2]
     shown = "".join(letter if letter.isprintable() else "?" for letter in name[:60])
     if not name or name.startswith("."):
         raise BadNameError(f'"{shown}" is not a name for a file: it is empty or begins with a dot.')
@@ -73,7 +57,7 @@ def control_file(names: Iterable[str]) -> str | None:
     Args:
         names: Names of all uploaded files.
     """
-    listed = sorted(name for name in names if "/" not in name)
+    listed = sorted(names)
     if any(name.casefold() in CONTROL_NAMES for name in listed):
         return None
     texts = (name for name in listed if name.casefold().endswith(".txt") and name.casefold() not in NOT_CONTROL)

@@ -14,7 +14,7 @@ from typing import Any
 from splatpipe.pipeline.app.node.tasks.disk import free_bytes
 from splatpipe.pipeline.app.node.tasks.jobs import JobStore
 from splatpipe.pipeline.app.node.tasks.log import log_lines
-from splatpipe.pipeline.app.node.tasks.names import kind_of, name_with_folders, plain_name
+from splatpipe.pipeline.app.node.tasks.names import kind_of, plain_name
 from splatpipe.pipeline.app.node.tasks.options import NO_OPTIONS, GivenOptions
 from splatpipe.pipeline.app.node.tasks.outgoing import (
     WEBHOOK_DELAY_S,
@@ -46,6 +46,7 @@ from splatpipe.pipeline.engine.files.output_file import new_file
 
 UUID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}", re.IGNORECASE)
 MAX_NAME_LETTERS = 255
+UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # of names: what cannot be stored, or steers a terminal
 HOUSEKEEPING_S = 30.0
 MAX_NOTED = 50  # files that were left out are named in the log
 NOT_USED = "{} was not used: it is neither a photo nor a survey file."
@@ -185,13 +186,12 @@ class Node:
             raise UnknownTaskError(uuid)
         return task
 
-    def begin_file(self, uuid: str, given_name: str, *, folders: bool = False) -> PartFile | None:
+    def begin_file(self, uuid: str, given_name: str) -> PartFile | None:
         """Begin to receive a file of a task; None if a run has no use for it, so that it is not kept.
 
         Args:
             uuid: The task.
             given_name: Its name as the client states it.
-            folders: Keep its folders; NodeODM's clients expect them to be cut off.
 
         Raises:
             UnknownTaskError: if there is no such task.
@@ -199,7 +199,7 @@ class Node:
             RefusedTaskError: if the task has too many files, or the disk too little room.
             OSError: if the disk is full.
         """
-        name = name_with_folders(given_name) if folders else plain_name(given_name)
+        name = plain_name(given_name)
         task = self.tasks.get(uuid)
         upload = self.tasks.uploads(uuid)
         if kind_of(name) == "other":
@@ -208,6 +208,8 @@ class Node:
             return None
         if upload.count() >= MAX_FILES:
             raise RefusedTaskError(f"A task has at most {MAX_FILES:,} files.")
+        if upload.size() >= MAX_TASK_BYTES:
+            raise RefusedTaskError(f"A task has at most {MAX_TASK_BYTES / 1e9:,.0f} GB.")
         self.reserve(0)
         self.tasks.keep_open(uuid)
         return upload.begin(name)
@@ -336,6 +338,8 @@ class Node:
                 with new_file(place) as file:
 
                     def write(block: bytes, into: Any = file) -> None:
+                        if self.tasks.get(uuid).state != "fetching":  # it was cancelled
+                            raise UnknownTaskError(uuid)
                         self.reserve(len(block))
                         into.write(block)
 
@@ -377,7 +381,7 @@ def _with(task: Task, wanted: NewTask) -> Task:
     """A task with what a client asks for."""
     return replace(
         task,
-        name=wanted.name[:MAX_NAME_LETTERS],
+        name=UNFIT.sub("?", wanted.name[:MAX_NAME_LETTERS]),
         created_ms=wanted.created_ms or task.created_ms,
         options=dict(wanted.options.values),
         dropped=wanted.options.dropped,

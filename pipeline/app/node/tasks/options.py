@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -155,9 +155,23 @@ def _short(value: str) -> str:
 
 
 def _crs(value: str) -> str:
-    if len(_short(value)) > 500:
-        raise OptionValueError("is longer than 500 characters")
-    return "auto" if value.lower() in ("", "gcp") else value  # `gcp`: WebODM's word for that of the control file
+    # `gcp`: WebODM's word for that of the control file
+    return _named(value, "crs") if _short(value).lower() not in ("", "gcp", "auto") else "auto"
+
+
+def _vertical(value: str) -> str:
+    return _named(value, "vertical") if _short(value).lower() not in ("", "auto") else "auto"
+
+
+def _named(value: str, kind: str) -> str:
+    """Check a CRS or a vertical datum as the run does, which would say so only after the upload."""
+    from splatpipe.pipeline.survey.crs.crs_names import checked  # loads PROJ
+
+    try:
+        checked(value, kind)
+    except ValueError as error:
+        raise OptionValueError(str(error)) from error
+    return value
 
 
 def _duration(value: str) -> str:
@@ -210,7 +224,8 @@ CATALOGUE = (
         "bool",
         "false",
         "bool",
-        "Make the orthophoto and the surface model only: no splat is trained, and there is no cloud or mesh.",
+        "Make the orthophoto and the surface model only: no splat is trained, and there is no mesh. With dtm also the "
+        "terrain model, and with it the point cloud.",
     ),
     Option(
         "pc-quality",
@@ -260,7 +275,7 @@ CATALOGUE = (
         "auto",
         "string",
         "Vertical datum of the photos' heights: ellipsoidal, EPSG:n or unknown. Default: %(default)s",
-        _short,
+        _vertical,
     ),
     Option(
         "check-points",
@@ -307,6 +322,19 @@ class GivenOptions:
 
 
 NO_OPTIONS = GivenOptions({})
+
+INSTEAD = {
+    "gps-accuracy": "the accuracy of positions is read from the photos and from geo.txt",
+    "auto-boundary": "maps end where three photos see the ground; give a boundary for a smaller area",
+}
+"""What takes the place of options that clients often send."""
+
+
+def dropped_notes(dropped: Sequence[str]) -> tuple[str, ...]:
+    """Lines for a task's log on the options that were dropped."""
+    instead = [f"{name}: {INSTEAD[name]}." for name in dropped if name in INSTEAD]
+    said = f"Options that this node does not offer were ignored: {', '.join(dropped)}"
+    return (said, *instead) if dropped else ()
 
 
 def parse_options(text: str | None) -> GivenOptions:

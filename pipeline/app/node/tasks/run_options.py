@@ -13,7 +13,9 @@ FEATURE_PIXELS = {"ultra": 4000, "high": 2800, "medium": 2000, "low": 1400, "low
 CM = 0.01
 MARK_FIRST = "mark-first"  # the option with which a run stops where control points can be marked
 MARKED_AFTER = "georef"  # marks are predicted in photos by the georeferenced model
-NOT_TRAINED_UNTIL = "ortho"  # the last stage that an orthophoto needs; training is not among those before it
+# Last stages whose inputs do not include training: of the orthophoto alone, and of all surface products.
+ORTHOPHOTO_UNTIL, SURFACES_UNTIL = "ortho", "publish"
+LEFT_OUT_BY_FAST = ("mesh", "mesh-size", "facades", "sky")  # options that a fast orthophoto makes idle
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,9 @@ def run_options(given: Mapping[str, Any]) -> RunOptions:
     asked = [name for name in ("dsm", "dtm", "facades") if given.get(name)]
     asked += ["ortho"] if fast or "orthophoto-resolution" in given else []
     asked += ["dsm"] if "dem-resolution" in given else []
-    asked += [] if fast or preset == "preview" else ["cloud"]  # viewers of clients take their CRS from it
+    terrain = fast and bool(given.get("dtm"))
+    # Viewers of clients take their CRS from the cloud; its stage reads the terrain model.
+    asked += ["cloud"] if terrain or not (fast or preset == "preview") else []
     asked += ["mesh"] if mesh else []
     tables: dict[str, dict[str, Any]] = options_for(",".join(asked), None, None) if asked else {}
 
@@ -78,7 +82,20 @@ def run_options(given: Mapping[str, Any]) -> RunOptions:
     return RunOptions(
         preset,
         tables,
-        MARKED_AFTER if given.get(MARK_FIRST) else NOT_TRAINED_UNTIL if fast else "",
+        _until(given),
         given.get("time-budget", ""),
         given.get("boundary", ""),
     )
+
+
+def _until(given: Mapping[str, Any]) -> str:
+    if given.get(MARK_FIRST):
+        return MARKED_AFTER
+    if not given.get("fast-orthophoto"):
+        return ""
+    return SURFACES_UNTIL if given.get("dtm") else ORTHOPHOTO_UNTIL
+
+
+def idle_options(given: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the options that others make idle: a fast orthophoto trains nothing, and makes no mesh."""
+    return tuple(name for name in LEFT_OUT_BY_FAST if given.get(name)) if given.get("fast-orthophoto") else ()

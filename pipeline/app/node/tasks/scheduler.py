@@ -5,23 +5,22 @@ Each is called in a thread of its own, changes records under the supervisor's lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from splatpipe.pipeline.app.node.tasks.jobs import Job, JobStore, job_key
 from splatpipe.pipeline.app.node.tasks.names import kind_of
-from splatpipe.pipeline.app.node.tasks.options import GivenOptions
+from splatpipe.pipeline.app.node.tasks.options import GivenOptions, dropped_notes
 from splatpipe.pipeline.app.node.tasks.queue import start_times
 from splatpipe.pipeline.app.node.tasks.record import NEVER_STARTED, Task
+from splatpipe.pipeline.app.node.tasks.run_options import idle_options
 from splatpipe.pipeline.app.node.tasks.settings import Settings
 from splatpipe.pipeline.app.node.tasks.status import TaskStatus, task_status
 from splatpipe.pipeline.app.node.tasks.store import TaskStore, UnknownTaskError, now_ms
 from splatpipe.pipeline.app.node.tasks.supervisor import Supervisor
 from splatpipe.pipeline.app.node.tasks.uploads import FileFacts
-
-DROPPED = "Options that this node does not offer were ignored"
 
 
 class RefusedTaskError(ValueError):
@@ -88,7 +87,7 @@ class Scheduler:
             if task.state not in ("uploading", "fetching"):
                 return task
             job = self._join(job_key(photos, task.options, task.outputs), photos, task)
-            notes = (*task.notes, *_dropped_note(task.dropped))
+            notes = (*task.notes, *_notes_on_options(task))
             task = self.tasks.change(uuid, state="wanted", job=job.key, images=images, notes=notes)
             self._supervisor.changed.notify_all()
         self._store_once(job, uuid)
@@ -167,10 +166,10 @@ class Scheduler:
             photos = self.tasks.uploads(uuid).digests() if task.has_ended else {}
             if not photos:
                 raise RefusedTaskError("Task cannot be restarted")
-            notes = tuple(line for line in task.notes if not line.startswith(DROPPED))
+            before = _notes_on_options(task)
             if options is not None:
                 task = replace(task, options=dict(options.values), dropped=options.dropped)
-            notes += _dropped_note(task.dropped)
+            notes = (*(line for line in task.notes if line not in before), *_notes_on_options(task))
             job = self._join(job_key(photos, task.options, task.outputs), photos, task, seed=task.job)
             task = self.tasks.replace(
                 replace(
@@ -223,5 +222,7 @@ class Scheduler:
         return start_times(supervisor.waiting(), supervisor.running(), self.settings.parallel)
 
 
-def _dropped_note(dropped: Sequence[str]) -> tuple[str, ...]:
-    return (f"{DROPPED}: {', '.join(dropped)}",) if dropped else ()
+def _notes_on_options(task: Task) -> tuple[str, ...]:
+    """Lines for the log on the options of a task that do nothing."""
+    idle = idle_options(task.options)
+    return (*dropped_notes(task.dropped), *([f"With fast-orthophoto there is no: {', '.join(idle)}."] if idle else []))

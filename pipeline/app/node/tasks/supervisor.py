@@ -287,6 +287,7 @@ class Supervisor:
     def _put_off(self, job: Job, why: str, delay_s: float = 30.0) -> None:
         """Try again later: trouble that passes is not the task's."""
         self._not_before[job.key] = time.monotonic() + delay_s
+        why = self.jobs.labels(job.key).plain(why)  # clients read it
         self.jobs.change(job.key, waiting=why)
         self._tell(f"{job.key[:8]} is tried again in {delay_s:.0f} s: {why}")
 

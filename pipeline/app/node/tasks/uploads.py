@@ -10,14 +10,12 @@ import hashlib
 import json
 import os
 import threading
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatpipe.pipeline.app.node.tasks.names import MAX_FOLDERS
-from splatpipe.pipeline.engine.files.durable import sync_folder, write_durably
+from splatpipe.pipeline.engine.files.durable import sync_folder
 from splatpipe.pipeline.engine.files.output_file import appended_file, new_file, token
 from splatpipe.pipeline.engine.files.small_file import read_small
 
@@ -59,7 +57,7 @@ class UploadFolder:
         self._facts = self._read_journal()
 
     def sizes(self) -> dict[str, int]:
-        """Sizes of the whole files by name, in order; names have their folders."""
+        """Sizes of the whole files by name, in order."""
         with self._lock:
             return dict(sorted(self._present().items()))
 
@@ -71,6 +69,10 @@ class UploadFolder:
         """Number of files whose digests are known."""
         return len(self._facts)
 
+    def size(self) -> int:
+        """Bytes of these files."""
+        return sum(each.size for each in tuple(self._facts.values()))
+
     def close(self) -> None:
         """Take no further files: only those that are there already, a second time."""
         with self._lock:
@@ -80,18 +82,6 @@ class UploadFolder:
         """Take files again."""
         with self._lock:
             self._closed = False
-
-    def put(self, name: str, content: bytes) -> None:
-        """Write a file in place of another of its name, whether files are taken or not.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
-        with self._lock:
-            (self.path / name).parent.mkdir(parents=True, exist_ok=True)
-            write_durably(self.path / name, lambda file: file.write(content))
-            self._facts[name] = FileFacts(len(content), hashlib.sha256(content).hexdigest())
-            self._note(name, self._facts[name])
 
     def begin(self, name: str) -> PartFile:
         """Begin to receive a file.
@@ -159,14 +149,15 @@ class UploadFolder:
             if self._closed:
                 part.discard()
                 raise ClosedUploadError("The upload of this task is complete: no further file is taken.")
-            target.parent.mkdir(parents=True, exist_ok=True)
             part.path.rename(target)
-            sync_folder(target.parent)
+            sync_folder(self.path)
             self._facts[part.name] = facts
             self._note(part.name, facts)
 
     def _present(self) -> dict[str, int]:
-        return dict(_files(self.path, "", MAX_FOLDERS))
+        with os.scandir(self.path) as entries:
+            shown = [each for each in entries if not each.name.startswith(".") and each.is_file(follow_symlinks=False)]
+            return {each.name: each.stat().st_size for each in shown}
 
     def _note(self, name: str, facts: FileFacts) -> None:
         with suppress(OSError), appended_file(self.path / JOURNAL) as file:  # without it, the file is read again
@@ -232,18 +223,6 @@ class PartFile:
         with suppress(OSError, ValueError):
             self._file.close()
         self.path.unlink(missing_ok=True)
-
-
-def _files(folder: Path, above: str, depth: int) -> Iterator[tuple[str, int]]:
-    """Names and sizes of the files in a folder and those below, except hidden ones."""
-    with os.scandir(folder) as entries:
-        for each in entries:
-            if each.name.startswith("."):
-                continue
-            if each.is_dir(follow_symlinks=False) and depth:
-                yield from _files(Path(each.path), f"{above}{each.name}/", depth - 1)
-            elif each.is_file(follow_symlinks=False):
-                yield f"{above}{each.name}", each.stat().st_size
 
 
 def file_facts(path: Path) -> FileFacts:

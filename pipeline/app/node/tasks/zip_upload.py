@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 from splatpipe.pipeline.app.node.tasks.names import BadNameError, kind_of, plain_name
 from splatpipe.pipeline.app.node.tasks.settings import MAX_FILES, MAX_TASK_BYTES
@@ -14,6 +18,10 @@ from splatpipe.pipeline.app.node.tasks.uploads import NameTakenError, UploadFold
 BLOCK_BYTES = 1 << 20
 MAX_RATIO = 200  # bytes for each byte in the zip: photos are compressed already, and text by a factor of 50 at most
 RATIO_FROM_BYTES = 10 << 20
+MAX_READ_BYTES = 8 << 20  # at once: of 20,000 entries, the directory has 6 MB with names of 240 bytes
+MAX_END_BYTES = (1 << 16) + 22  # the end record with the longest comment
+MALFORMED = (struct.error, ValueError, OverflowError)  # fields that fit neither each other nor the file
+BROKEN = "The zip cannot be read: it is broken, encrypted, or no zip."
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 UNIX = 3  # the system whose file modes an entry may have
 LINK = 0o120000
@@ -41,22 +49,44 @@ def unpack(path: Path, upload: UploadFolder, limit: Callable[[str], int], reserv
     """
     left_out = []
     try:
-        with zipfile.ZipFile(path) as archive:
+        with _CarefulFile(path) as file, zipfile.ZipFile(cast("io.BufferedReader", file)) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
             if len(entries) > MAX_FILES:
                 raise BadZipError(f"The zip has {len(entries):,} files; {MAX_FILES:,} are allowed.")
-            total = 0
+            total, most = 0, min(MAX_TASK_BYTES, max(RATIO_FROM_BYTES, MAX_RATIO * path.stat().st_size))
             for entry in entries:
                 name = _name_of(entry)
                 if name is None or kind_of(name) == "other":
                     left_out.append(entry.filename[:60])
                     continue
                 total += _unpack_one(archive, entry, name, upload, limit(name), reserve)
-                if total > MAX_TASK_BYTES:
-                    raise BadZipError("The zip unpacks to more than a task may have.")
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, UnicodeError) as error:
-        raise BadZipError("The zip cannot be read: it is broken, encrypted, or no zip.") from error
+                if total > most:  # also of entries that share their bytes
+                    raise BadZipError("The zip unpacks to more than a task may have, or than it can hold.")
+    except BadZipError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, *MALFORMED) as error:
+        raise BadZipError(BROKEN) from error
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+        raise BadZipError(BROKEN) from error  # an entry that begins before the file does
     return left_out
+
+
+class _CarefulFile(io.FileIO):
+    """A file that is not read into memory as a whole: zipfile reads a directory of any size at once."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read bytes.
+
+        Raises:
+            BadZipFile: if more are asked for than an honest zip has in one piece.
+        """
+        if size is None or size < 0:
+            size = MAX_END_BYTES  # zipfile asks so for the end of the file
+        if size > MAX_READ_BYTES:
+            raise zipfile.BadZipFile("it has a directory that is too large")
+        return super().read(size) or b""
 
 
 def _name_of(entry: zipfile.ZipInfo) -> str | None:

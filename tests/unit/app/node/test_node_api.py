@@ -1,19 +1,25 @@
 """NodeODM's calls without a server: what clients send, and what they are told."""
 
+import asyncio
 import json
+import time
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import pytest
 from asgi import Reply, ask
-from starlette.types import ASGIApp
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message
 
+from splatpipe.pipeline.app.node.api import bodies
 from splatpipe.pipeline.app.node.api.guard import Guard
 from splatpipe.pipeline.app.node.api.routes import Api, make_app
 from splatpipe.pipeline.app.node.serve import NodeOptions, check_options
+from splatpipe.pipeline.app.node.tasks import node as node_module
 from splatpipe.pipeline.app.node.tasks.node import Node
 from splatpipe.pipeline.app.node.tasks.settings import Settings
+from splatpipe.pipeline.app.node.tasks.uploads import UploadFolder
 from splatpipe.pipeline.engine.errors import UsageError
 
 TOKEN = "a token of sixteen letters"
@@ -139,6 +145,39 @@ def test_wrong_options_are_named_as_json_in_the_error(client: Client) -> None:
     assert json.loads(found["error"]) == [{"name": "mesh-size", "error": "is not a number"}]
 
 
+def test_an_unknown_crs_is_refused_before_anything_is_uploaded(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[str] = []
+    monkeypatch.setattr(UploadFolder, "begin", lambda _folder, name: begun.append(name))
+    options = '[{"name": "crs", "value": "EPSG:99999"}]'
+    for found in (
+        client.form("/task/new/init", options=options),
+        client.form("/task/new", {"a.jpg": b"one"}, options=options),
+        client.form("/task/new", {"a.jpg": b"one"}, outputs='["../x"]'),
+    ):
+        assert "There is no EPSG:99999." in found["error"] or "outputs" in found["error"]
+    assert begun == [] and client.node.tasks.all() == []
+
+
+def test_a_restart_with_an_unknown_crs_is_refused_and_the_log_names_what_is_idle(client: Client) -> None:
+    uuid = client.queued(options='[{"name": "auto-boundary", "value": true}]')
+    client.command("cancel", uuid=uuid)
+    assert (
+        "EPSG:99999"
+        in client.command("restart", uuid=uuid, options='[{"name": "crs", "value": "EPSG:99999"}]')["error"]
+    )
+    options = json.dumps([{"name": name, "value": True} for name in ("fast-orthophoto", "mesh", "gps-accuracy")])
+    assert client.command("restart", uuid=uuid, options=options) == {"success": True}
+    log = client.get(f"/task/{uuid}/output")
+    assert [word in "\n".join(log) for word in ("auto-boundary", "gps-accuracy", "no: mesh")] == [False, True, True]
+
+
+@pytest.mark.parametrize("name", ["\ud800", "a\0b", "\x1b[2J"])
+def test_a_name_that_cannot_be_stored_or_shown_is_mended(client: Client, name: str) -> None:
+    body = json.dumps({"name": name}).encode()
+    uuid = client.post("/task/new/init", body, ("content-type", "application/json"))["uuid"]
+    assert client.node.tasks.get(uuid).name.isprintable()
+
+
 def test_options_that_are_not_offered_and_files_without_use_are_named_in_the_log(client: Client) -> None:
     uuid = client.form("/task/new/init", options='[{"name": "pc-ept", "value": true}]')["uuid"]
     client.form(f"/task/new/upload/{uuid}", {"a.jpg": b"x", "seed.zip": b"y"})
@@ -232,6 +271,28 @@ def test_a_body_for_which_there_is_no_disk_is_refused_by_its_length(
     assert client.node.tasks.uploads(uuid).names() == []
 
 
+def test_a_task_has_a_most_of_bytes_however_many_requests_send_them(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(node_module, "MAX_TASK_BYTES", 5)
+    uuid = client.form("/task/new/init")["uuid"]
+    assert client.form(f"/task/new/upload/{uuid}", {"a.jpg": b"123456"}) == {"success": True}
+    assert "at most" in client.form(f"/task/new/upload/{uuid}", {"b.jpg": b"x"})["error"]
+    assert client.node.tasks.uploads(uuid).names() == ["a.jpg"]
+
+
+def test_a_body_that_is_not_used_is_waited_for_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bodies, "IGNORED_S", 0.05)
+
+    async def receive() -> Message:
+        await asyncio.sleep(0.01)
+        return {"type": "http.request", "body": b"x", "more_body": True}
+
+    began_s = time.monotonic()
+    asyncio.run(bodies.drain(Request({"type": "http", "method": "POST", "headers": []}, receive), 1 << 20))
+    assert time.monotonic() - began_s < 20.0
+
+
 def test_a_poll_never_reads_the_disk(client: Client) -> None:
     uuid = client.queued()
     for path in (client.node.tasks.path(uuid) / "task.json", client.node.settings.folder / "jobs"):
@@ -247,7 +308,8 @@ class TestGuard:
 
     def test_without_a_token_only_this_machine_and_no_other_page(self, client: Client) -> None:
         assert self.reply(client, host="localhost:1234").status == 200
-        assert self.reply(client, host="rebound.example").status == 421
+        assert self.reply(client, host="[::1]:3000").status == 200
+        assert self.reply(client, host="[::2]:3000").status == self.reply(client, host="rebound.example").status == 421
         assert self.reply(client, headers=[("origin", "http://127.0.0.1:3000")]).status == 200
         assert self.reply(client, headers=[("origin", "http://evil.example")]).status == 403
         assert self.reply(client, headers=[("origin", "null")]).status == 403

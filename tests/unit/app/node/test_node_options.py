@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 
@@ -10,10 +11,14 @@ from splatpipe.pipeline.app.node.tasks.options import (
     LISTED,
     MAX_BOUNDARY_CHARACTERS,
     WrongOptionsError,
+    dropped_notes,
     parse_options,
 )
-from splatpipe.pipeline.app.node.tasks.run_options import run_options
+from splatpipe.pipeline.app.node.tasks.run_options import idle_options, run_options
 from splatpipe.pipeline.engine.config import load_preset, resolve
+from splatpipe.pipeline.engine.runs.line import Line
+from splatpipe.pipeline.engine.runs.store import Part
+from splatpipe.stages.line import LINE
 from splatpipe.stages.options import LineConfig
 
 SQUARE = {"type": "Polygon", "coordinates": [[[7, 48], [7.001, 48], [7.001, 48.001], [7, 48.001], [7, 48]]]}
@@ -72,6 +77,13 @@ def test_numbers_come_as_text_and_are_echoed_as_numbers_in_the_order_sent() -> N
         ("boundary", "x" * (MAX_BOUNDARY_CHARACTERS + 1)),
         ("time-budget", "soon"),
         ("crs", "x" * 501),
+        ("crs", "EPSG:99999"),
+        ("crs", "25833"),
+        ("crs", "WGS84 UTM 61N"),
+        ("crs", "+proj=pipeline +step"),
+        ("crs", "EPSG:5783"),
+        ("vertical", "EPSG:25832"),
+        ("vertical", "sea level"),
         ("crs", "\ud800"),
         ("check-points", "A1\nB2"),
         ("vertical", "\0"),
@@ -121,9 +133,41 @@ def test_a_fast_orthophoto_trains_no_splat() -> None:
     assert "cloud" not in run.tables
 
 
+def test_with_a_fast_orthophoto_the_terrain_model_comes_if_it_is_asked_for_and_still_no_splat() -> None:
+    for preset in ("preview", "standard", "high"):
+        run = run_options({"fast-orthophoto": True, "dtm": True, "preset": preset, "mesh": True})
+        config = resolve(LineConfig, [load_preset(run.preset), run.tables])
+        outside = {f"source.{name}" for name in ("photos", "control", "boundary", "geo", "lens", "scale_bars")}
+        line = Line(LINE, config, {name: Part(Path(), "") for name in outside}, Path())
+        needed = {stage.name for stage in line.needed(run.until)}
+        assert {"dsm", "dtm", "ortho"} <= needed and not needed & {"initialize", "blocks", "train", "export"}
+        assert config.dtm.enabled and config.ortho.enabled and not config.mesh.enabled
+
+
+def test_options_that_others_make_idle_are_named() -> None:
+    assert idle_options({"fast-orthophoto": True, "mesh-size": 500, "sky": True, "dtm": True}) == ("mesh-size", "sky")
+    assert idle_options({"mesh-size": 500, "sky": True}) == ()
+
+
+def test_what_takes_the_place_of_an_option_that_is_not_offered_is_said() -> None:
+    said = dropped_notes(parse_options(_sent(gps_accuracy=3, pc_ept=True)).dropped)
+    assert "gps-accuracy, pc-ept" in said[0] and "geo.txt" in said[1] and len(said) == 2
+    assert dropped_notes(()) == ()
+
+
 def test_a_preview_makes_maps_only_if_asked() -> None:
     assert "ortho" not in run_options({"preset": "preview"}).tables
     assert run_options({"preset": "preview", "dtm": True}).tables["dtm"] == {"enabled": True}
+
+
+@pytest.mark.parametrize("crs", ["EPSG:25832", "epsg:25832+7837", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84"])
+def test_each_form_of_a_crs_that_a_run_takes_is_taken_as_it_was_sent(crs: str) -> None:
+    assert parse_options(_sent(crs=crs, vertical="ellipsoidal")).values == {"crs": crs, "vertical": "ellipsoidal"}
+
+
+def test_an_unknown_crs_is_refused_in_the_words_of_the_command() -> None:
+    with pytest.raises(WrongOptionsError, match=r"crs: There is no EPSG:99999\. Look it up at epsg\.org"):
+        parse_options(_sent(crs="EPSG:99999"))
 
 
 def test_the_crs_of_the_control_file_is_asked_for_by_webodms_word() -> None:

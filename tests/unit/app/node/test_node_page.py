@@ -79,6 +79,28 @@ def test_the_token_is_exchanged_for_a_cookie_that_only_our_pages_get(home: Home)
     assert over_tls.headers["set-cookie"].endswith("; Secure")
 
 
+def test_strangers_send_no_more_than_a_token(home: Home) -> None:
+    answer = ask(home.app, "/page/enter", value={"token": "x" * 20_000})
+    assert answer.status != 200 and "set-cookie" not in answer.headers
+
+
+def test_an_unknown_crs_is_said_on_the_page_and_the_job_can_be_started_with_another(home: Home) -> None:
+    uuid = home.begun("a.jpg")
+    wrong = {"name": "a house", "options": [{"name": "crs", "value": "EPSG:99999"}]}
+    answer = home.ours(f"api/start/{uuid}", value=wrong)
+    assert answer.status == 422 and answer.json["error"].startswith("crs: There is no EPSG:99999.")
+    right = {"name": "a house", "options": [{"name": "crs", "value": "EPSG:25832"}]}
+    assert home.ours(f"api/start/{uuid}", value=right).status == 200
+
+
+def test_folders_of_a_name_are_cut_off(home: Home) -> None:
+    uuid = home.begun("a.jpg")
+    assert home.upload(uuid, "a.jpg/b.jpg").status == home.upload(uuid, "../c.jpg").status == 200
+    assert home.ours(f"api/files/{uuid}").json["files"] == {name: len(JPEG) for name in ("b.jpg", "c.jpg")} | {
+        "a.jpg": 5
+    }
+
+
 def test_without_a_token_the_printed_key_opens_and_nothing_else(tmp_path: Path) -> None:
     home = Home(tmp_path, "")
     assert "set-cookie" not in ask(home.app, "/").headers

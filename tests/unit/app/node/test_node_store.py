@@ -2,7 +2,9 @@
 
 import io
 import json
+import threading
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -232,6 +234,15 @@ def test_a_job_is_read_as_it_was_written(tmp_path: Path, node: Node) -> None:
     assert JobStore(tmp_path).get(task.job) == node.jobs.get(task.job)
 
 
+def test_why_a_run_waits_names_no_folder_of_the_host(node: Node, tmp_path: Path) -> None:
+    task = _committed(node)
+    job = node.jobs.get(task.job)
+    assert job is not None
+    node.scheduler._supervisor._put_off(job, f"Its forecast failed: {tmp_path}/jobs/{job.key}/forecast.json is a link.")
+    waiting = node.jobs.get(task.job)
+    assert waiting is not None and str(tmp_path) not in waiting.waiting and "forecast.json" in waiting.waiting
+
+
 def test_names_of_the_host_are_not_in_a_log(node: Node) -> None:
     task = _committed(node)
     node.jobs.output(task.job).write_text(f"wrote {node.jobs.out(task.job)}/dsm.tif\nsee /home/mia/acme/log.txt\n")
@@ -257,3 +268,26 @@ def test_a_zip_is_fetched_unpacked_and_queued_or_the_task_fails_with_a_sentence(
     assert (ended["good"].state, ended["good"].images) == ("wanted", 1) and "readme.md" in ended["good"].notes[0]
     assert ended["bad"].state == "failed" and "zip" in ended["bad"].error
     assert not list(tmp_path.rglob("fetched.zip"))
+
+
+@pytest.mark.parametrize("command", ["cancel", "remove"])
+def test_a_zip_is_not_fetched_to_its_end_for_a_task_that_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    node = Node(Settings(tmp_path, least_free_bytes=0), ["files.example"])
+    written, ended = threading.Event(), threading.Event()
+
+    def endless(_parts: object, write: Callable[[bytes], None], _most: int) -> None:
+        try:
+            while True:
+                write(b"x")
+                written.set()
+        finally:
+            ended.set()
+
+    monkeypatch.setattr(node_module, "fetch", endless)
+    task = node.commit(node.create(NewTask(zip_url="http://files.example/a")).uuid)
+    assert written.wait(30.0)
+    getattr(node.scheduler, command)(task.uuid)
+    assert ended.wait(30.0)
+    wait_until(lambda: not list((tmp_path / "tasks").rglob("fetched.zip")))
