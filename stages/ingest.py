@@ -159,7 +159,7 @@ def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]
 def _require_photos(folder: Path, chosen: Selection) -> None:
     left_out = chosen.left_out
     names = [photo.name for photo in chosen.photos]
-    few = explain_too_few(folder, folder, names, len(left_out), chosen.scan.others)
+    few = explain_too_few(folder, folder, names, chosen.pictures_left_out, chosen.scan.others)
     if few is None:
         return
     message, hint = few
@@ -170,7 +170,8 @@ def _require_photos(folder: Path, chosen: Selection) -> None:
 
 def _report_excluded(chosen: Selection, config: IngestConfig, report: Reporter) -> None:
     """Issue one warning, or for files that belong to photos one note, per reason, naming the files."""
-    for kind, say in (("unusable", report.warning), ("duplicate", report.warning), ("companion", report.note)):
+    reports = {"unusable": report.warning, "duplicate": report.warning, "companion": report.note}
+    for kind, say in (reports | {"products": report.note}).items():
         for reason, names in by_reason(entry for entry in chosen.left_out if entry.kind == kind).items():
             say(f"Left out: {with_reason(names, reason)}.")
     if chosen.note:

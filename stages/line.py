@@ -17,7 +17,7 @@ from splatpipe.pipeline.web.options import ExportConfig, PublishConfig
 
 INGEST = Stage(
     "ingest",
-    version=6,
+    version=7,
     config=IngestConfig,
     reads=("source.photos", "source.geo", "source.lens"),
     parts={

@@ -86,7 +86,7 @@ def read_capture(
     photos = chosen.photos
     findings += [*filmed, *_left_out(chosen)]
     names = [photo.name for photo in photos]
-    few = explain_too_few(source.folder, Path(source.folder.name), names, len(chosen.left_out), chosen.scan.others)
+    few = explain_too_few(source.folder, Path(source.folder.name), names, chosen.pictures_left_out, chosen.scan.others)
     if few is not None:
         findings.append(Finding("too-few", "error", *few))
     groups, camera_of = group_cameras(photos)
@@ -166,14 +166,14 @@ def _left_out(chosen: Selection) -> list[Finding]:
     """One finding per reason, for all duplicates one, and one for files that belong to photos."""
     of_kind = {
         kind: [entry for entry in chosen.left_out if entry.kind == kind]
-        for kind in ("unusable", "duplicate", "companion")
+        for kind in ("unusable", "duplicate", "companion", "products")
     }
     findings = [
         Finding("unreadable", "warning", f"{with_reason(names, reason)}.", _hint(reason, names), tuple(sorted(names)))
         for reason, names in sorted(by_reason(of_kind["unusable"]).items())
     ]
     findings += _duplicates(of_kind["duplicate"])
-    for reason, names in sorted(by_reason(of_kind["companion"]).items()):
+    for reason, names in sorted(by_reason([*of_kind["companion"], *of_kind["products"]]).items()):
         findings.append(Finding("companions", "note", f"{with_reason(names, reason)}.", "A run leaves them out."))
     if chosen.note:
         findings.append(Finding("bands", "note", chosen.note))

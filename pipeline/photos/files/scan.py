@@ -65,12 +65,13 @@ class ExcludedPhoto:
     Attributes:
         name: Its name.
         reason: Why: the end of a sentence that starts with the name.
-        kind: ``companion`` for a file that belongs to a photo, so that nothing is lost without it.
+        kind: ``companion`` for a file that belongs to a photo, so that nothing is lost without it; ``products`` for a
+            folder of a program's products.
     """
 
     name: str
     reason: str
-    kind: Literal["unusable", "duplicate", "companion"] = "unusable"
+    kind: Literal["unusable", "duplicate", "companion", "products"] = "unusable"
 
 
 def by_reason(entries: Iterable[ExcludedPhoto]) -> dict[str, list[str]]:
@@ -139,7 +140,7 @@ def scan_folder(root: Path) -> Scan:
         products = {name: program for name in folders if (program := program_of(Path(folder) / name))}
         folders[:] = [name for name in folders if name not in products]
         left_out += [
-            ExcludedPhoto(_name(Path(folder) / name, root), f"is a folder of {program}'s products", "companion")
+            ExcludedPhoto(_name(Path(folder) / name, root), f"is a folder of {program}'s products", "products")
             for name, program in products.items()
         ]
         links = [Path(folder) / name for name in folders if (Path(folder) / name).is_symlink()]

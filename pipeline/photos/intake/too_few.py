@@ -48,4 +48,6 @@ def explain_too_few(
             return f"There are no photos in {shown}, and {printable(name)} {other.what}.", other.hint
     if others:
         return f"There are no photos in {shown}, only {others} other file{'s' if others > 1 else ''}.", GIVE_PHOTOS
+    if folder.is_dir() and any(folder.iterdir()):  # other folders
+        return f"There are no photos in {shown}.", GIVE_PHOTOS
     return f"The folder {shown} is empty.", GIVE_PHOTOS

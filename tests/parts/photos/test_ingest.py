@@ -373,7 +373,8 @@ def test_photo_replaced_unnoticed_is_refused_by_the_stage_that_reads_it(folder: 
 
 
 def test_duplicates_are_left_out(folder: Path) -> None:
-    shutil.copy(folder / "a.jpg", folder / "copy of a.jpg")
+    for name in ("copy of a.jpg", "a(1).jpg", "a - Copy.jpg"):  # "(" and " " come before "."
+        shutil.copy(folder / "a.jpg", folder / name)
     exif = Image.Exif()
     exif[271] = "edited"
     save(folder / "a2.png", 5)
@@ -385,7 +386,7 @@ def test_duplicates_are_left_out(folder: Path) -> None:
     result = ingest(folder)
     assert set(result.photos) == {"a.jpg", "b.jpg", "a2.png"}
     assert result.left_out == {
-        "copy of a.jpg": "is the same file as a.jpg",
+        **dict.fromkeys(("copy of a.jpg", "a(1).jpg", "a - Copy.jpg"), "is the same file as a.jpg"),
         "a3.png": "has the same pixels as a2.png",
         "b2.jpg": "has the same pixels as b.jpg",
     }
@@ -502,6 +503,10 @@ def test_links_to_devices_pipes_and_pseudo_files_are_named_and_never_opened(fold
         (lambda path: None, ["is empty"]),
         (lambda path: (path / "notes.txt").write_text("hello"), ["no photos", "1 other file"]),
         (lambda path: (path / "f.mkv").write_bytes(b"film"), ["no photos", "f.mkv is a film in a container"]),
+        (
+            lambda path: save(path / "odm_dem/dsm.tif"),
+            ["no photos in", "odm_dem is a folder of OpenDroneMap's products"],
+        ),
         (lambda path: (path / "f.zip").write_bytes(b"PK"), ["no photos", "f.zip is an archive"]),
         (lambda path: (path / "x.jpg").write_text("hello"), ["None of the 1 pictures", "x.jpg", "no JPEG"]),
         (lambda path: save(path / "x.jpg"), ["only one usable photo", "x.jpg"]),
