@@ -39,7 +39,14 @@ from splatpipe.pipeline.survey.placing.assumed_heights import with_assumed_heigh
 from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
 from splatpipe.pipeline.survey.placing.gps import georeference, read_positions, report_fit, report_frame
 from splatpipe.pipeline.survey.placing.level import Positions, arbitrary_frame
-from splatpipe.pipeline.survey.placing.model import SparseModel, copy_model, model_of, read_model, report_unmatched
+from splatpipe.pipeline.survey.placing.model import (
+    SparseModel,
+    copy_model,
+    model_of,
+    read_model,
+    report_choice,
+    report_unmatched,
+)
 from splatpipe.pipeline.survey.plausibility.last_look import Placed, report_contradictions
 from splatpipe.pipeline.survey.points.surveyed_points import Survey, load_survey
 from splatpipe.pipeline.survey.targets.target_finds import load_finds, load_wanted
@@ -77,6 +84,7 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     photos = load_photo_list(inputs["ingest.photos"]).by_name()
     model = read_model(source, photos)
     if inputs.photos_dir in source.parents:
+        report_choice(inputs.photos_dir, report)
         report_unmatched(model.names, photos, report)
     positions = with_assumed_heights(model, read_positions(inputs["ingest.positions"]))
     report.progress(1, 3, "fitting the positions", "steps")

@@ -13,7 +13,8 @@ import numpy as np
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.json_file import write_json
-from splatpipe.pipeline.engine.runs.source import find_model, is_film
+from splatpipe.pipeline.engine.runs.colmap_folder import has_model
+from splatpipe.pipeline.engine.runs.source import is_film
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import NAMES_SHOWN, hint_of_several, list_names, printable
 from splatpipe.pipeline.photos.files.photo_list import (
@@ -47,6 +48,7 @@ from splatpipe.pipeline.photos.intake.preparation import (
     prepare_masks,
     select_photos,
 )
+from splatpipe.pipeline.photos.intake.too_few import explain_too_few
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.video.frames import FRAMES_DIR, extract_frames
 from splatpipe.pipeline.sfm.lenses.known_lenses import lenses_json, state_lenses
@@ -56,7 +58,6 @@ from splatpipe.pipeline.survey.positions.photo_positions import PositionList, po
 from splatpipe.pipeline.survey.positions.position_sources import stated_places
 from splatpipe.pipeline.survey.positions.stated_positions import FilePlaces, read_places
 
-MIN_PHOTOS = 2
 MEASURES = "film.measures"  # of a film, from which a killed run goes on; no part, so that it does not outlast the stage
 
 
@@ -76,7 +77,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     _remove_leftovers(out, part, {root, out / MEASURES} if filmed else set())
     if filmed:
         _report_film(extract_frames(given, root, config, inputs.machine.threads, report, out / MEASURES), report)
-    if config.bands == AUTO and find_model(inputs.photos_dir) is not None:
+    if config.bands == AUTO and has_model(inputs.photos_dir):
         config = config.model_copy(update={"bands": ALL})  # a given model says which photos it is of
     work = Preparation(config, inputs.machine.threads, part, report)
     # Libraries print their own warnings about odd metadata tags. Filters are process-wide, so they are set only here.
@@ -98,7 +99,7 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
             report.warning(issue.message, issue.hint)
     described = describe_cameras(photos, groups, camera_of)
     report_cameras(described, report)
-    if find_model(inputs.photos_dir) is None:  # a given model comes with its calibration
+    if not has_model(inputs.photos_dir):  # a given model comes with its calibration
         _warn_of_focal(groups, refused_calibrations(photos), report)
     listed = [_photo(photo, camera_of, masked, skies) for photo in photos]
     if filmed:
@@ -156,39 +157,21 @@ def _photo(checked: CheckedPhoto, camera_of: Mapping[str, int], masked: set[str]
 
 
 def _require_photos(folder: Path, chosen: Selection) -> None:
-    photos, left_out, scan = chosen.photos, chosen.left_out, chosen.scan
-    if len(photos) >= MIN_PHOTOS:
+    left_out = chosen.left_out
+    names = [photo.name for photo in chosen.photos]
+    few = explain_too_few(folder, folder, names, chosen.pictures_left_out, chosen.scan.others)
+    if few is None:
         return
+    message, hint = few
     listing = "".join(f"\n  {printable(entry.name)} {entry.reason}" for entry in left_out[:NAMES_SHOWN])
     more = f"\n  … and {len(left_out) - NAMES_SHOWN} more" if len(left_out) > NAMES_SHOWN else ""
-    if photos:
-        message = f"There is only one usable photo in {folder}: {printable(photos[0].name)}."
-        hint = "A reconstruction needs many overlapping photos of the same scene, at least three."
-    elif left_out:
-        message = f"None of the {len(left_out)} pictures in {folder} can be used."
-        hint = "Give JPEG, PNG or TIFF photos."
-    elif films := _films_in(folder):
-        message = (
-            f"There are no photos in {folder}, but {'films' if len(films) > 1 else 'a film'}: {list_names(films)}."
-        )
-        hint = f"Give the film itself: splatpipe run {printable(str(folder / films[0]))} OUT"
-    elif scan.others:
-        message = f"There are no photos in {folder}, only {scan.others} other file{'s' if scan.others > 1 else ''}."
-        hint = "Give the folder that has the JPEG, PNG or TIFF photos."
-    else:
-        message = f"The folder {folder} is empty."
-        hint = "Give the folder that has the JPEG, PNG or TIFF photos."
     raise SplatpipeError(message + (f" Left out:{listing}{more}" if left_out else ""), hint=hint)
-
-
-def _films_in(folder: Path) -> list[str]:
-    """Names of the films directly in a folder."""
-    return sorted(path.name for path in folder.iterdir() if is_film(path)) if folder.is_dir() else []
 
 
 def _report_excluded(chosen: Selection, config: IngestConfig, report: Reporter) -> None:
     """Issue one warning, or for files that belong to photos one note, per reason, naming the files."""
-    for kind, say in (("unusable", report.warning), ("duplicate", report.warning), ("companion", report.note)):
+    reports = {"unusable": report.warning, "duplicate": report.warning, "companion": report.note}
+    for kind, say in (reports | {"products": report.note}).items():
         for reason, names in by_reason(entry for entry in chosen.left_out if entry.kind == kind).items():
             say(f"Left out: {with_reason(names, reason)}.")
     if chosen.note:
@@ -207,7 +190,7 @@ def _lenses(
     report: Reporter,
 ) -> tuple[list[CameraGroup], list[StatedLens | None]]:
     """Return the groups with the given lens calibrations, if any; a given model has its own."""
-    if find_model(inputs.photos_dir) is not None:
+    if has_model(inputs.photos_dir):
         return list(groups), [None] * len(groups)
     members: dict[int, list[CheckedPhoto]] = {}
     for photo in photos:

@@ -17,7 +17,7 @@ from splatpipe.pipeline.web.options import ExportConfig, PublishConfig
 
 INGEST = Stage(
     "ingest",
-    version=6,
+    version=7,
     config=IngestConfig,
     reads=("source.photos", "source.geo", "source.lens"),
     parts={
@@ -79,7 +79,7 @@ CONTROL = Stage(
 )
 TARGETS = Stage(
     "targets",
-    version=2,
+    version=3,
     config=TargetsConfig,
     reads=("control.points", "sparse.model", "ingest.photos", "ingest.positions"),
     parts={"found": "targets.json"},
@@ -88,7 +88,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=12,
+    version=13,
     config=GeorefConfig,
     reads=(
         "sparse.model",
@@ -117,7 +117,7 @@ GEOREF = Stage(
 )
 UNDISTORT = Stage(
     "undistort",
-    version=2,
+    version=3,
     config=UndistortConfig,
     reads=("georef.model", "ingest.photos"),
     parts={"dataset": "dataset"},

@@ -30,6 +30,7 @@ class FieldInput:
         ends: Exit code of the last command.
         says: Words that it has to print, in any order, without regard to line breaks.
         silent_on: Words that it must not print.
+        mended: What was wrong or unkind when the input was made; empty if nothing was.
     """
 
     name: str
@@ -38,6 +39,7 @@ class FieldInput:
     ends: int
     says: tuple[str, ...] = ()
     silent_on: tuple[str, ...] = ()
+    mended: str = ""
 
 
 def demo_bytes(index: int) -> bytes:

@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 from field_case import FieldInput
+from field_table import table_row
 from film_inputs import FILM_INPUTS
 from folder_inputs import FOLDER_INPUTS
 from model_inputs import MODEL_INPUTS
@@ -27,12 +28,12 @@ FIELD_INPUTS = PHOTO_INPUTS + TABLE_INPUTS + SPLAT_INPUTS + MODEL_INPUTS + FILM_
 LIMIT_S = 600.0
 
 
-def faults_of(case: FieldInput, folder: Path) -> list[str]:
-    """Make an input, run its commands, print what they print; return what is wrong."""
+def try_input(case: FieldInput, folder: Path) -> tuple[str, list[str]]:
+    """Make an input, run its commands, print what they print; return its row of the table, and what is wrong."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     case.make(folder)
-    printed, ended = "", 0
+    printed, ended, answers = "", 0, []
     for command in case.commands:
         start = time.monotonic()
         done = subprocess.run(
@@ -44,27 +45,29 @@ def faults_of(case: FieldInput, folder: Path) -> list[str]:
         text = done.stderr + done.stdout
         print(f"$ splatpipe {command}\n{text.rstrip()}\n-> {ended}, {time.monotonic() - start:.0f} s", flush=True)
         printed += text
+        answers.append((command, text, ended))
     words = " ".join(printed.replace("│", " ").split())
     faults = [f"ended with {ended}, not {case.ends}"] if ended != case.ends else []
     faults += [f"does not say: {wanted}" for wanted in case.says if wanted not in words]
-    return faults + [f"says: {unwanted}" for unwanted in case.silent_on if unwanted in words]
+    faults += [f"says: {unwanted}" for unwanted in case.silent_on if unwanted in words]
+    return table_row(case, answers, faults), faults
 
 
 def main() -> None:
-    """Run the inputs of these names, or all; print a line for each at the end."""
+    """Run the inputs of these names, or all; print a table at the end, as docs/measurements/inputs.md has it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path, help="a folder for the inputs")
     parser.add_argument("names", nargs="*", help="names of inputs; all without")
     options = parser.parse_args()
-    found = {}
+    rows, faulty = [], False
     for case in FIELD_INPUTS:
         if not options.names or case.name in options.names:
             print(f"\n=== {case.name}: {(case.make.__doc__ or '').strip()}")
-            found[case.name] = faults_of(case, options.work.resolve() / case.name)
-    print()
-    for name, faults in found.items():
-        print(f"{name:28} {'; '.join(faults) or 'as it should'}")
-    sys.exit(any(found.values()))
+            row, faults = try_input(case, options.work.resolve() / case.name)
+            rows.append(row)
+            faulty |= bool(faults)
+    print("\n| input | it printed | |\n|---|---|---|", *rows, sep="\n")
+    sys.exit(faulty)
 
 
 if __name__ == "__main__":

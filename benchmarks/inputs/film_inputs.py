@@ -117,6 +117,7 @@ FILM_INPUTS = (
         other_subtitles,
         tuple(f"check {name}.mp4" for name in ("comma", "autel", "speech", "later")),
         0,
+        mended="decimal commas: all frames at whole degrees",
     ),
     FieldInput(
         "other_containers",
@@ -125,7 +126,16 @@ FILM_INPUTS = (
             f"check {name}"
             for name in ("flight.mkv", "flight.avi", "flight.mts", "flight.webm", "list.mp4", "voice.mp4")
         ),
-        0,
+        1,
+        ("is a film in a container that is not read", "MP4 and MOV are read", "-c:v copy"),
+        mended='"is a file"',
     ),
-    FieldInput("films_in_a_folder", films_in_a_folder, ("check films", "check both"), 0),
+    FieldInput(
+        "films_in_a_folder",
+        films_in_a_folder,
+        ("check films", "check both"),
+        0,
+        ("There are no photos in films, but films: DJI_0001.MP4, DJI_0002.MP4",),
+        mended='"None of the photos can be used"',
+    ),
 )

@@ -57,6 +57,37 @@ def out_among_photos(folder: Path) -> None:
     copy_photos(folder, FEW)
 
 
+def earlier_run(folder: Path) -> None:
+    """Photos, and among them the folder of an earlier run, with its dataset, moved there by hand."""
+    photos = copy_photos(folder, FEW)
+    dataset = folder / "first/stages/undistort-0123456789abcdef/dataset/images"
+    dataset.mkdir(parents=True)
+    for path in photos:
+        with Image.open(path) as image:
+            image.resize((800, 600)).save(dataset / path.name)
+    (folder / "first/stages/format.json").write_text(json.dumps({"format": 1}))
+    (folder / "first/splat.ply").write_bytes(b"ply\n")
+
+
+def cloud_copies(folder: Path) -> None:
+    """A synchronised folder: "(1)" copies, a conflicted copy, extensions in mixed case, a placeholder of iCloud."""
+    photos = copy_photos(folder, FEW, lambda i: f"IMG_{i:04}.{('JPG', 'jpg', 'JpEg', 'JPEG', 'jpG')[i]}")
+    for path, name in zip(
+        photos, ("IMG_0000(1).JPG", "IMG_0001 (Anna's conflicted copy 2026-06-18).jpg"), strict=False
+    ):
+        (folder / name).write_bytes(path.read_bytes())
+    (folder / ".IMG_0009.JPG.icloud").write_bytes(b"bplist00")
+
+
+def webodm_assets(folder: Path) -> None:
+    """WebODM's all.zip, unpacked: no photos, only products."""
+    pixels = np.random.default_rng(0).integers(0, 255, (256, 256, 3), dtype=np.uint8)
+    for name in ("orthophoto_tiles/18/140908/90870.png", "odm_orthophoto/odm_orthophoto.tif", "dsm_tiles/1/2/3.png"):
+        (folder / "all" / name).parent.mkdir(parents=True)
+        Image.fromarray(pixels).save(folder / "all" / name)
+    (folder / "all/cameras.json").write_text("{}")
+
+
 def nerfstudio_folder(folder: Path) -> None:
     """nerfstudio's folder: images, images_2, images_4, transforms.json and colmap/sparse/0."""
     photos = copy_photos(folder / "data/images", range(0, 40, 4))
@@ -80,7 +111,15 @@ def not_a_folder(folder: Path) -> None:
 
 FOLDER_INPUTS = (
     FieldInput("card_dump", card_dump, ("check .",), 0),
-    FieldInput("odm_project", odm_project, ("check project",), 0),
+    FieldInput(
+        "odm_project",
+        odm_project,
+        ("check project",),
+        0,
+        ("each is a folder of OpenDroneMap's products", "5 photos."),
+        ("Duplicate",),
+        mended="products counted as photos",
+    ),
     FieldInput(
         "out_among_photos", out_among_photos, ("run . out --until features", "run . out --until ingest", "check ."), 0
     ),
@@ -96,6 +135,33 @@ FOLDER_INPUTS = (
             "check list.txt",
             "run photos photos --until ingest",
         ),
+        2,
+        ("photos.zip is an archive", "one.JPG is a single picture", "The folder empty is empty"),
+        mended='"is a file"',
+    ),
+    FieldInput(
+        "earlier_run",
+        earlier_run,
+        ("check .",),
         0,
+        ("first is a folder of splatpipe's products", "5 photos."),
+        ("Duplicate",),
+        mended="its pictures counted as photos",
+    ),
+    FieldInput(
+        "cloud_copies",
+        cloud_copies,
+        ("check .",),
+        0,
+        ("IMG_0000(1).JPG is the same file as IMG_0000.JPG", "5 photos."),
+        mended="the original was left out",
+    ),
+    FieldInput(
+        "webodm_assets",
+        webodm_assets,
+        ("check all",),
+        1,
+        ("OpenDroneMap's products",),
+        mended="tiles counted as photos",
     ),
 )

@@ -129,10 +129,89 @@ def missing_camera(folder: Path) -> None:
     write_photos(folder / "cm/images")
 
 
+def windows_text(folder: Path) -> None:
+    """A model edited on Windows: byte order marks, CRLF; images.txt redirected by PowerShell (UTF-16)."""
+    write_model(folder / "cm/sparse/0", rename=lambda name: name.replace("DJI_", "Höhe "))
+    write_photos(folder / "cm/images", rename=lambda name: name.replace("DJI_", "Höhe "))
+    for name, encoding in (("cameras", "utf-8-sig"), ("images", "utf-16"), ("points3D", "utf-8-sig")):
+        path = folder / f"cm/sparse/0/{name}.txt"
+        path.write_bytes(path.read_text(encoding="utf-8").replace("\n", "\r\n").encode(encoding))
+
+
+def one_line_photos(folder: Path) -> None:
+    """Known poses from a script: images.txt without the lines of keypoints, points3D.txt empty."""
+    write_model(folder / "cm/sparse/0", points=False)
+    path = folder / "cm/sparse/0/images.txt"
+    path.write_text("".join(f"{line}\n" for line in path.read_text().splitlines() if line))
+    write_photos(folder / "cm/images")
+
+
+def stripped_text(folder: Path) -> None:
+    """The same with the empty lines, but an editor has stripped those at the end."""
+    write_model(folder / "cm/sparse/0", points=False)
+    path = folder / "cm/sparse/0/images.txt"
+    path.write_text(path.read_text().rstrip("\n") + "\n")
+    write_photos(folder / "cm/images")
+
+
+def thinned_points(folder: Path) -> None:
+    """points3D.txt thinned out to every tenth point; images.txt still refers to all."""
+    write_model(folder / "cm/sparse/0")
+    path = folder / "cm/sparse/0/points3D.txt"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[::10]))
+    write_photos(folder / "cm/images")
+
+
 MODEL_INPUTS = (
-    FieldInput("windows_folders", windows_folders, ("run cm out --until georef",), 0),
-    FieldInput("several_models", several_models, ("run cm out --until georef",), 0),
+    FieldInput(
+        "windows_folders",
+        windows_folders,
+        ("run cm out --until georef",),
+        0,
+        silent_on=("missing in images/", "not in the model"),
+        mended="names cut at their blanks",
+    ),
+    FieldInput(
+        "several_models",
+        several_models,
+        ("run cm out --until georef",),
+        0,
+        ("sparse/1 with 9 photos is used; sparse/0 has 2",),
+        mended="sparse/0, in silence",
+    ),
     FieldInput("small_photos", small_photos, ("run cm out --until georef",), 0),
     FieldInput("other_extensions", other_extensions, ("run cm out --until georef",), 0),
-    FieldInput("missing_camera", missing_camera, ("run cm out --until georef",), 0),
+    FieldInput(
+        "missing_camera",
+        missing_camera,
+        ("run cm out --until georef",),
+        1,
+        ("DJI_0005.JPG has camera 2, which is not in cameras.txt",),
+        mended='"Rig with ID 2 does not exist"',
+    ),
+    FieldInput(
+        "windows_text",
+        windows_text,
+        ("run cm out --until georef",),
+        0,
+        silent_on=("missing in images/", "not in the model"),
+        mended="refused in C++",
+    ),
+    FieldInput(
+        "one_line_photos",
+        one_line_photos,
+        ("run cm out --until georef",),
+        1,
+        ("each photo has two lines, of which the second may be empty",),
+        mended="every other photo lost in silence",
+    ),
+    FieldInput(
+        "stripped_text",
+        stripped_text,
+        ("run cm out --until georef",),
+        0,
+        silent_on=("missing in images/", "not in the model"),
+        mended="the last photo lost in silence",
+    ),
+    FieldInput("thinned_points", thinned_points, ("run cm out --until undistort",), 0, mended='"KeyError"'),
 )

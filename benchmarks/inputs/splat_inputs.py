@@ -179,26 +179,32 @@ def old_compressed(folder: Path) -> None:
 
 SPLAT_INPUTS = (
     FieldInput("big_endian_doubles", big_endian_doubles, ("convert cloud.ply cloud.spz",), 0),
-    FieldInput("windows_ascii", windows_ascii, ("convert cloud.ply cloud.spz",), 0),
+    FieldInput("windows_ascii", windows_ascii, ("convert cloud.ply cloud.spz",), 1, ("Export it as a binary PLY",)),
     FieldInput(
         "degrees_of_harmonics",
         degrees_of_harmonics,
         ("edit rest_24.ply both.ply --merge rest_0.ply --no-pictures", "convert rest_10.ply ten.spz"),
-        0,
+        1,
+        ("10 f_rest properties are not spherical harmonics",),
     ),
-    FieldInput("byte_colours", byte_colours, ("convert splat.ply splat.spz",), 0),
-    FieldInput("flat_gaussians", flat_gaussians, ("convert point_cloud.ply flat.spz",), 0),
-    FieldInput("mip_filter", mip_filter, ("convert point_cloud.ply mip.spz",), 0),
+    FieldInput("byte_colours", byte_colours, ("convert splat.ply splat.spz",), 0, mended='"a point cloud"'),
+    FieldInput("flat_gaussians", flat_gaussians, ("convert point_cloud.ply flat.spz",), 0, mended='"incomplete"'),
+    FieldInput(
+        "mip_filter", mip_filter, ("convert point_cloud.ply mip.spz",), 0, mended="the filter was dropped in silence"
+    ),
     FieldInput("odd_quaternions", odd_quaternions, ("convert cloud.ply cloud.spz",), 0),
-    FieldInput("linear_values", linear_values, ("convert activated.ply cloud.spz",), 0),
-    FieldInput("browser_files", browser_files, ("convert scene.splat a.ply", "convert scene.ksplat b.ply"), 0),
+    FieldInput(
+        "linear_values", linear_values, ("convert activated.ply cloud.spz",), 0, mended="read as logits in silence"
+    ),
+    FieldInput("browser_files", browser_files, ("convert scene.splat a.ply", "convert scene.ksplat b.ply"), 1),
     FieldInput(
         "points_only",
         points_only,
         tuple(f"convert {name}.ply {name}.spz" for name in ("points3D", "mesh", "empty", "half")),
-        0,
+        1,
+        ("not a splat but a point cloud or a mesh", "half.ply is cut off"),
     ),
-    FieldInput("old_spz", old_spz, tuple(f"convert {name}.spz {name}.ply" for name in ("first", "second", "plain")), 0),
+    FieldInput("old_spz", old_spz, tuple(f"convert {name}.spz {name}.ply" for name in ("first", "second", "plain")), 1),
     FieldInput("trainer_folder", trainer_folder, ("convert model model.spz",), 0),
     FieldInput(
         "old_compressed",

@@ -183,17 +183,46 @@ def boundaries(folder: Path) -> None:
 
 
 TABLE_INPUTS = (
-    FieldInput("german_excel", german_excel, ("check photos",), 0),
-    FieldInput("utf16_tabs", utf16_tabs, ("check photos",), 0),
-    FieldInput("degrees_minutes_seconds", degrees_minutes_seconds, ("check photos",), 0),
-    FieldInput("names_as_paths", names_as_paths, ("check photos",), 0),
-    FieldInput("latitude_first", latitude_first, ("check photos",), 0),
-    FieldInput("wrong_zone", wrong_zone, ("check photos",), 0),
-    FieldInput("repeated_names", repeated_names, ("check photos",), 0),
-    FieldInput("thousands_separators", thousands_separators, ("check photos",), 0),
-    FieldInput("feet", feet, ("check photos",), 0),
-    FieldInput("holes_in_tables", holes_in_tables, ("check photos",), 0),
-    FieldInput("kml_boundary", kml_boundary, ("run photos out --boundary site.kml --until ingest",), 0),
+    FieldInput(
+        "german_excel", german_excel, ("check photos",), 0, ("No problems found",), mended="code page, titles: not read"
+    ),
+    FieldInput(
+        "utf16_tabs", utf16_tabs, ("check photos",), 0, ("No problems found",), mended="names in quotes: not found"
+    ),
+    FieldInput(
+        "degrees_minutes_seconds",
+        degrees_minutes_seconds,
+        ("check photos",),
+        1,
+        ("Write degrees with decimals",),
+        mended="the notation was not named",
+    ),
+    FieldInput(
+        "names_as_paths",
+        names_as_paths,
+        ("check photos",),
+        0,
+        ("No problems found",),
+        mended="names in quotes: not found",
+    ),
+    FieldInput(
+        "latitude_first", latitude_first, ("check photos",), 1, ("Read with its first two coordinates swapped",)
+    ),
+    FieldInput("wrong_zone", wrong_zone, ("check photos",), 1, ("Read as EPSG:32633, they match",)),
+    FieldInput("repeated_names", repeated_names, ("check photos",), 1, ("P01 has other coordinates than in line 2",)),
+    FieldInput(
+        "thousands_separators",
+        thousands_separators,
+        ("check photos",),
+        1,
+        ("without signs between thousands",),
+        mended="the notation was not named",
+    ),
+    FieldInput("feet", feet, ("check photos",), 0, ("No problems found",)),
+    FieldInput("holes_in_tables", holes_in_tables, ("check photos",), 1, ("was in line 2 already",)),
+    FieldInput(
+        "kml_boundary", kml_boundary, ("run photos out --boundary site.kml --until ingest",), 1, ("save it as GeoJSON",)
+    ),
     FieldInput(
         "boundaries",
         boundaries,

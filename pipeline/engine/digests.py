@@ -13,6 +13,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.json_file import read_json
+from splatpipe.pipeline.engine.files.product_folders import program_of
 from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.machine import pseudo_devices
 from splatpipe.pipeline.engine.stage import JSON
@@ -45,11 +46,13 @@ def file_digest(path: Path) -> str:
 def walk_files(root: Path) -> Iterator[Path]:
     """Yield every regular file below ``root`` in sorted order.
 
-    Hidden names, symlinked folders and the kernel's pseudo files are skipped.
+    Hidden names, symlinked folders, folders of a program's products and the kernel's pseudo files are skipped.
     """
     pseudo = pseudo_devices()
     for folder, folders, files in os.walk(root):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        folders[:] = sorted(
+            name for name in folders if not name.startswith(".") and not program_of(Path(folder) / name)
+        )
         for name in sorted(files):
             path = Path(folder) / name
             if not name.startswith(".") and is_real_file(path, pseudo):

@@ -25,7 +25,7 @@ from splatpipe.pipeline.app.preflight.findings import (
     worst_first,
 )
 from splatpipe.pipeline.app.preflight.heights import height_findings, predict_heights
-from splatpipe.pipeline.app.preflight.intake import MIN_PHOTOS, Intake, read_capture
+from splatpipe.pipeline.app.preflight.intake import Intake, read_capture
 from splatpipe.pipeline.app.preflight.overlap import (
     MatchGraph,
     flight_of,
@@ -53,6 +53,7 @@ from splatpipe.pipeline.engine.runs.needs import whole
 from splatpipe.pipeline.engine.runs.source import RunSource, is_film, open_source
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.photos.intake.detail import DIRECTIONS
+from splatpipe.pipeline.photos.intake.too_few import MIN_PHOTOS
 from splatpipe.pipeline.sfm.matching.comparison import brighter_ev, detail_loss
 from splatpipe.pipeline.sfm.matching.keypoints import single_threaded_opencv
 from splatpipe.pipeline.sfm.matching.quick_match import QuickFeatures, quick_features
@@ -108,6 +109,8 @@ def examine_capture(
     # No OUT is written: any folder outside the photos will do.
     source = open_source(photos, folder.parent / f"{folder.name}-out", LINE, config)
     intake, findings = read_capture(source, config, threads, report, scratch)
+    if source.models is not None and source.models.note:
+        findings.append(Finding("models", "note", source.models.note))
     examination = examine_photos(intake, threads, report)
     control, control_problems = _control(source, config, intake)
     heights = predict_heights(source, config, intake, report)

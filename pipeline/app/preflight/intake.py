@@ -24,6 +24,7 @@ from splatpipe.pipeline.photos.intake.camera_issues import find_camera_issues
 from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 from splatpipe.pipeline.photos.intake.preparation import Preparation, Selection, select_photos
+from splatpipe.pipeline.photos.intake.too_few import explain_too_few
 from splatpipe.pipeline.photos.video.frames import extract_frames
 from splatpipe.pipeline.sfm.pairing.layout import make_layout, make_views
 from splatpipe.pipeline.sfm.pairing.pairs import Layout
@@ -34,8 +35,6 @@ from splatpipe.pipeline.survey.positions.stated_positions import FilePlaces, rea
 
 if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
-
-MIN_PHOTOS = 2  # the number ingest requires
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,10 @@ def read_capture(
             findings = [Finding("bands", "error", error.message, error.hint)]
     photos = chosen.photos
     findings += [*filmed, *_left_out(chosen)]
-    if len(photos) < MIN_PHOTOS:
-        findings.append(_too_few(len(photos)))
+    names = [photo.name for photo in photos]
+    few = explain_too_few(source.folder, Path(source.folder.name), names, chosen.pictures_left_out, chosen.scan.others)
+    if few is not None:
+        findings.append(Finding("too-few", "error", *few))
     groups, camera_of = group_cameras(photos)
     findings += [finding_from_issue(issue) for issue in find_camera_issues(photos, groups, camera_of)]
     places, troubles = _file_places(source, config, photos)
@@ -165,14 +166,14 @@ def _left_out(chosen: Selection) -> list[Finding]:
     """One finding per reason, for all duplicates one, and one for files that belong to photos."""
     of_kind = {
         kind: [entry for entry in chosen.left_out if entry.kind == kind]
-        for kind in ("unusable", "duplicate", "companion")
+        for kind in ("unusable", "duplicate", "companion", "products")
     }
     findings = [
         Finding("unreadable", "warning", f"{with_reason(names, reason)}.", _hint(reason, names), tuple(sorted(names)))
         for reason, names in sorted(by_reason(of_kind["unusable"]).items())
     ]
     findings += _duplicates(of_kind["duplicate"])
-    for reason, names in sorted(by_reason(of_kind["companion"]).items()):
+    for reason, names in sorted(by_reason([*of_kind["companion"], *of_kind["products"]]).items()):
         findings.append(Finding("companions", "note", f"{with_reason(names, reason)}.", "A run leaves them out."))
     if chosen.note:
         findings.append(Finding("bands", "note", chosen.note))
@@ -199,9 +200,3 @@ def _duplicates(entries: Sequence[ExcludedPhoto]) -> list[Finding]:
     names = tuple(sorted({entry.name for entry in entries} | twins))
     text = f"Duplicate photos: {'; '.join(descriptions[:5])}{more}."
     return [Finding("duplicate", "warning", text, "The duplicates are left out; was a card copied twice?", names)]
-
-
-def _too_few(count: int) -> Finding:
-    text = "None of the photos can be used." if count == 0 else "There is only one usable photo."
-    hint = "A reconstruction needs many overlapping photos of the same scene."
-    return Finding("too-few", "error", text, hint)

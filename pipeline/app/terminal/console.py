@@ -88,7 +88,7 @@ class RunConsole:
     """Shows a run's events on stderr; a sink for the runner."""
 
     def __init__(self) -> None:
-        self._console = Console(file=sys.stderr, highlight=False)
+        self._console = Console(file=sys.stderr, highlight=False, emoji=False)
         self._order: list[str] = []
         self._live: Progress | None = None
         self._task: TaskID | None = None
@@ -237,7 +237,9 @@ def show_error(error: SplatpipeError) -> None:
     lines = [escape(error.message)]
     if error.hint:
         lines.append(f"[bold]→[/] {escape(error.hint)}")
-    Console(file=sys.stderr, highlight=False).print(Panel("\n".join(lines), title="splatpipe", border_style="red"))
+    Console(file=sys.stderr, highlight=False, emoji=False).print(
+        Panel("\n".join(lines), title="splatpipe", border_style="red")
+    )
 
 
 def show_status(statuses: Iterable[StageStatus]) -> None:
@@ -252,12 +254,12 @@ def show_status(statuses: Iterable[StageStatus]) -> None:
             what = sentence(row.stage.name, artifact.summary) if artifact else row.reason
             name = row.stage.name if row is status else f"  {row.stage.name}"
             table.add_row(name, f"[{COLOURS[row.state]}]{row.state}[/]", took, Text(what), end_section=False)
-    Console(highlight=False).print(table)
+    Console(highlight=False, emoji=False).print(table)
 
 
 def show_verdict(verdict: Verdict) -> None:
     """Print the verdict on a run, the report's first lines; ``show_bad_cameras`` prints why cameras are bad."""
-    console = Console(file=sys.stderr, highlight=False)
+    console = Console(file=sys.stderr, highlight=False, emoji=False)
     mark, colour = MARKS[verdict.level]
     console.print(f"\n[bold {colour}]{mark} {escape(verdict.headline)}.[/]  {escape(verdict.text)}", soft_wrap=True)
     for finding in verdict.findings:
@@ -276,7 +278,7 @@ def show_outputs(out: Path, seconds: float | None, files: Iterable[Path], result
         files: Its files.
         result_lines: Measurement results, one line each.
     """
-    console = Console(file=sys.stderr, highlight=False)
+    console = Console(file=sys.stderr, highlight=False, emoji=False)
     done = "All results are up to date: nothing to do." if seconds is None else f"Done in {duration(seconds)}."
     console.print(f"\n[bold]{done}[/]", soft_wrap=True)
     sizes: dict[Path, int] = {}
@@ -304,7 +306,7 @@ def show_bad_cameras(verdict: Mapping[str, JSON]) -> None:
     for reason in reasons:
         lines += [escape(reason["text"])] + ([f"[bold]→[/] {escape(reason['hint'])}"] if reason["hint"] else [])
     panel = Panel("\n".join(lines), title="The camera poses are unreliable", border_style="red")
-    Console(file=sys.stderr, highlight=False).print(panel)
+    Console(file=sys.stderr, highlight=False, emoji=False).print(panel)
 
 
 def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON]]) -> None:
@@ -321,7 +323,7 @@ def show_accuracy(report: Mapping[str, JSON], points: Sequence[Mapping[str, JSON
     if not groups:
         return
     gsd = report.get("gsd_m")
-    console = Console(file=sys.stderr, highlight=False)
+    console = Console(file=sys.stderr, highlight=False, emoji=False)
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
     console.print("\n[bold]Accuracy[/], root mean square in metres" + (f"; GSD {gsd:.4f} m" if gsd else ""))
@@ -389,12 +391,12 @@ def show_table(rows: Iterable[Sequence[str]], titles: Sequence[str]) -> None:
         table.add_column(title, overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console(highlight=False).print(table)
+    Console(highlight=False, emoji=False).print(table)
 
 
 def print_line(text: str) -> None:
     """Print one line for the user on stderr."""
-    Console(file=sys.stderr, highlight=False).print(escape(text), soft_wrap=True)
+    Console(file=sys.stderr, highlight=False, emoji=False).print(escape(text), soft_wrap=True)
 
 
 def _bytes(size: float) -> str:

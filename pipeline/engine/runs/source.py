@@ -11,9 +11,10 @@ from pydantic import BaseModel
 
 from splatpipe.pipeline.engine.digests import MAX_SOURCE_FILES, HashTable, walk_files
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
+from splatpipe.pipeline.engine.runs.colmap_folder import SparseModels, find_models
+from splatpipe.pipeline.engine.runs.other_input import other_input
 from splatpipe.pipeline.engine.stage import NamedFile, Reporter, Stage
 
-MODEL_FILES = ("cameras.bin", "cameras.txt")
 MASK_FOLDERS = ("masks", "sky_masks")
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v")
 SUBTITLE_SUFFIX = ".srt"
@@ -28,15 +29,20 @@ class RunSource:
 
     Attributes:
         folder: The folder, or the film, that the user named.
-        model: The COLMAP model in it, if it is a reconstruction and not just photos.
+        models: The COLMAP models in it, if it is a reconstruction and not just photos.
         named: The file of each single-file part, e.g. ``source.control``; None if there is none.
         skipped: Files to skip when collecting photos: those of single-file parts, used or not.
     """
 
     folder: Path
-    model: Path | None
+    models: SparseModels | None
     named: Mapping[str, Path | None] = field(default_factory=dict)
     skipped: frozenset[Path] = frozenset()
+
+    @property
+    def model(self) -> Path | None:
+        """The COLMAP model that is used; None for just photos."""
+        return None if self.models is None else self.models.used
 
     @property
     def part_files(self) -> dict[str, dict[str, Path]]:
@@ -90,7 +96,7 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
     """Examine the folder or film that the user named as PHOTOS.
 
     Args:
-        photos: A folder of photos, or one with ``images/`` and ``sparse/0``, or a film.
+        photos: A folder of photos, or one with ``images/`` and ``sparse/``, or a film.
         out: Where the run writes; must not lie inside the photos.
         stages: The pipeline, whose stages may read files that lie with the photos.
         config: The pipeline's configuration, which may name these files.
@@ -104,6 +110,9 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
         raise SplatpipeError(f"There is no folder {photos}.", hint="Check the path of the photos.")
     film = is_film(folder)
     if not folder.is_dir() and not film:
+        other = other_input(photos)
+        if other is not None:
+            raise SplatpipeError(f"{photos} {other.what}.", hint=other.hint)
         raise SplatpipeError(f"{photos} is a file.", hint="Give the folder with the photos, or a film (MP4, MOV).")
     if not os.access(folder, os.R_OK if film else os.R_OK | os.X_OK):
         what = "film" if film else "folder"
@@ -123,7 +132,7 @@ def open_source(photos: Path, out: Path, stages: Sequence[Stage] = (), config: B
         named[file.part] = _choose(file, f"{section}.{option}", setting, beside)
     skipped = {path for paths in beside.values() for path in paths.values()}
     skipped |= {path for path in named.values() if path is not None}
-    return RunSource(folder, find_model(folder), named, frozenset(skipped))
+    return RunSource(folder, find_models(folder), named, frozenset(skipped))
 
 
 def with_absolute_files(config: BaseModel, stages: Sequence[Stage]) -> BaseModel:
@@ -205,13 +214,3 @@ def film_files(path: Path) -> list[Path]:
         return []
     subtitles = subtitles_beside(path)
     return [path] if subtitles is None else [path, subtitles]
-
-
-def find_model(folder: Path) -> Path | None:
-    """The sparse model of a COLMAP-style folder (``images/`` beside ``sparse/0`` or ``sparse``), or None."""
-    if not (folder / "images").is_dir():
-        return None
-    for model in (folder / "sparse" / "0", folder / "sparse"):
-        if any((model / name).is_file() for name in MODEL_FILES):
-            return model
-    return None

@@ -1,1 +1,1 @@
-"""COLMAP's binary models, from untrusted bytes."""
+"""COLMAP's models, binary and text, from untrusted files."""

@@ -21,7 +21,7 @@ from PIL import Image
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.files.json_file import read_json, write_json
 from splatpipe.pipeline.engine.files.small_file import open_regular
-from splatpipe.pipeline.engine.runs.source import find_model
+from splatpipe.pipeline.engine.runs.colmap_folder import has_model
 from splatpipe.pipeline.photos.files.names import is_plain, list_names
 from splatpipe.pipeline.photos.files.picture_file import STRIP_ROWS, open_picture
 
@@ -103,7 +103,7 @@ def load_photo_list(part: Path) -> PhotoList:
 
 def photo_root(photos_dir: Path) -> Path:
     """The folder that photo names are relative to: ``images/`` in a COLMAP-style folder, else the folder itself."""
-    return photos_dir if find_model(photos_dir) is None else photos_dir / "images"
+    return photos_dir / "images" if has_model(photos_dir) else photos_dir
 
 
 def photo_path(photo: Photo, part: Path, photos_dir: Path) -> Path:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from splatpipe.pipeline.engine.files.product_folders import program_of
 from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.machine import pseudo_devices
 from splatpipe.pipeline.photos.files.companions import MASK, find_companions, other_formats, reason_of
@@ -64,12 +65,13 @@ class ExcludedPhoto:
     Attributes:
         name: Its name.
         reason: Why: the end of a sentence that starts with the name.
-        kind: ``companion`` for a file that belongs to a photo, so that nothing is lost without it.
+        kind: ``companion`` for a file that belongs to a photo, so that nothing is lost without it; ``products`` for a
+            folder of a program's products.
     """
 
     name: str
     reason: str
-    kind: Literal["unusable", "duplicate", "companion"] = "unusable"
+    kind: Literal["unusable", "duplicate", "companion", "products"] = "unusable"
 
 
 def by_reason(entries: Iterable[ExcludedPhoto]) -> dict[str, list[str]]:
@@ -114,9 +116,9 @@ class Scan:
 def scan_folder(root: Path) -> Scan:
     """Scan a folder recursively.
 
-    Hidden files and folders, ``masks/`` and ``sky_masks/`` are skipped, and so are links to folders (they may be
-    circular, and the run's digests do not cover their targets). A file is recognized as a photo by its first bytes,
-    whatever its name.
+    Hidden files and folders, ``masks/`` and ``sky_masks/`` are skipped, and so are folders of a program's products, and
+    links to folders (they may be circular, and the run's digests do not cover their targets). A file is recognized as
+    a photo by its first bytes, whatever its name.
 
     Args:
         root: The folder that names are relative to.
@@ -135,6 +137,12 @@ def scan_folder(root: Path) -> Scan:
     for folder, folders, files in os.walk(root, onerror=unreadable):
         skipped = [name for name in folders if name.startswith(".") or name.casefold() in (MASK_FOLDER, SKY_FOLDER)]
         folders[:] = sorted(set(folders) - set(skipped))
+        products = {name: program for name in folders if (program := program_of(Path(folder) / name))}
+        folders[:] = [name for name in folders if name not in products]
+        left_out += [
+            ExcludedPhoto(_name(Path(folder) / name, root), f"is a folder of {program}'s products", "products")
+            for name, program in products.items()
+        ]
         links = [Path(folder) / name for name in folders if (Path(folder) / name).is_symlink()]
         left_out += [ExcludedPhoto(_name(link, root), "is a link to a folder, which is not followed") for link in links]
         for name in files:

@@ -20,19 +20,21 @@ MASK_SHARE = 0.98  # least share of black or white pixels by which a picture is 
 
 
 def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], list[ExcludedPhoto]]:
-    """Keep the first of equal photos.
+    """Keep one of equal photos: that of the shortest file name, as copies are named ``NAME(1).JPG`` or ``NAME - Copy``.
+
+    Survey files name the original, which would be lost for them. Of equally long names the first is kept.
 
     Args:
-        photos: Sorted by name.
+        photos: All of them.
 
     Returns:
-        The photos that are kept, and the duplicates, with the name of the photo that each one equals.
+        The photos that are kept, sorted by name, and the duplicates, with the name of the photo that each one equals.
     """
     kept: list[CheckedPhoto] = []
     left_out: list[ExcludedPhoto] = []
     by_sha: dict[str, CheckedPhoto] = {}
     by_fingerprint: dict[str, CheckedPhoto] = {}
-    for photo in photos:
+    for photo in sorted(photos, key=lambda photo: (len(PurePosixPath(photo.name).name), photo.name)):
         twin = by_sha.get(photo.sha256)
         if twin is not None:
             left_out.append(ExcludedPhoto(photo.name, f"is the same file as {twin.name}", "duplicate"))
@@ -44,7 +46,7 @@ def split_duplicates(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto]
             continue
         by_fingerprint.setdefault(photo.fingerprint, photo)
         kept.append(photo)
-    return kept, left_out
+    return sorted(kept, key=lambda photo: photo.name), left_out
 
 
 def split_maps(photos: Sequence[CheckedPhoto]) -> tuple[list[CheckedPhoto], list[ExcludedPhoto], list[PhotoMask]]:

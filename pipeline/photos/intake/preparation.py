@@ -89,6 +89,11 @@ class Selection:
     masks: list[PhotoMask]
     note: str
 
+    @property
+    def pictures_left_out(self) -> int:
+        """The number of pictures among what is left out, without whole folders."""
+        return sum(entry.kind != "products" for entry in self.left_out)
+
 
 def select_photos(root: Path, work: Preparation) -> Selection:
     """Check the pictures of a folder, and choose those that are used.

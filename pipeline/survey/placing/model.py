@@ -14,6 +14,7 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
+from splatpipe.pipeline.engine.runs.colmap_folder import find_models
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
@@ -132,6 +133,13 @@ def model_of(reconstruction: pycolmap.Reconstruction, photos: Iterable[str]) -> 
     ids = tuple(image.image_id for image, good in zip(images, finite, strict=True) if good)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     return SparseModel(names, centres[finite], rotations[finite], cloud, ids, reconstruction)
+
+
+def report_choice(folder: Path, report: Reporter) -> None:
+    """Say which of a user's models is used, if there are several."""
+    models = find_models(folder)
+    if models is not None and models.note:
+        report.note(models.note)
 
 
 def report_unmatched(names: Iterable[str], photos: Collection[str], report: Reporter) -> None:

@@ -237,6 +237,32 @@ def test_findings_are_printed_even_if_the_page_cannot_be_written(tmp_path: Path)
     assert "[red]broken[bold].jpg" in done.stderr and "only one usable" not in done.stderr
 
 
+def test_what_lies_in_place_of_photos_is_named(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for file, words in {
+        "": ("The folder photos is empty", "Give the folder"),
+        "n.txt": ("only 1 other file", "Give the folder"),
+        "f.zip": ("f.zip is an archive", "Unpack it"),
+        "f.mp4": ("but a film: f.mp4", "splatpipe run photos/f.mp4 OUT"),
+    }.items():
+        (photos / file).touch()
+        (few,) = found(examined(photos), "too-few")
+        assert words[0] in few.message and words[1] in few.hint
+        assert str(tmp_path) not in few.message + few.hint  # the page may be sent on
+
+
+def test_several_models_are_told(tmp_path: Path) -> None:
+    (tmp_path / "cm/images").mkdir(parents=True)
+    for model, count in (("0", 2), ("1", 5)):
+        folder = tmp_path / "cm/sparse" / model
+        folder.mkdir(parents=True)
+        (folder / "cameras.txt").touch()
+        (folder / "images.txt").write_text("".join(f"{i} 1 0 0 0 0 0 0 1 {i}.jpg\n\n" for i in range(count)))
+    (told,) = found(examined(tmp_path / "cm"), "models")
+    assert told.severity == "note" and "sparse/1 with 5 photos is used; sparse/0 has 2" in told.message
+
+
 @pytest.mark.parametrize(
     ("north_m", "severities"),
     [

@@ -50,13 +50,15 @@ class Notes:
     """A reporter that records."""
 
     warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None:
         assert 0 <= done <= total
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None: ...
 
-    def note(self, message: str) -> None: ...
+    def note(self, message: str) -> None:
+        self.notes.append(message)
 
     def warning(self, message: str, hint: str = "") -> None:
         self.warnings.append(message)
@@ -70,6 +72,7 @@ class Result:
     out: Path
     folder: Path
     warnings: list[str]
+    notes: list[str]
 
     @property
     def photos(self) -> dict[str, Photo]:
@@ -106,7 +109,7 @@ def ingest(
     sources = {"source.geo": geo or absent, "source.lens": lens or absent}
     inputs = Inputs(sources, folder, {}, Machine(threads=threads))
     summary = run(IngestConfig(**options), inputs, target, notes)
-    return Result(summary, target, folder, notes.warnings)
+    return Result(summary, target, folder, notes.warnings, notes.notes)
 
 
 def picture(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
@@ -370,7 +373,8 @@ def test_photo_replaced_unnoticed_is_refused_by_the_stage_that_reads_it(folder: 
 
 
 def test_duplicates_are_left_out(folder: Path) -> None:
-    shutil.copy(folder / "a.jpg", folder / "copy of a.jpg")
+    for name in ("copy of a.jpg", "a(1).jpg", "a - Copy.jpg"):  # "(" and " " come before "."
+        shutil.copy(folder / "a.jpg", folder / name)
     exif = Image.Exif()
     exif[271] = "edited"
     save(folder / "a2.png", 5)
@@ -382,7 +386,7 @@ def test_duplicates_are_left_out(folder: Path) -> None:
     result = ingest(folder)
     assert set(result.photos) == {"a.jpg", "b.jpg", "a2.png"}
     assert result.left_out == {
-        "copy of a.jpg": "is the same file as a.jpg",
+        **dict.fromkeys(("copy of a.jpg", "a(1).jpg", "a - Copy.jpg"), "is the same file as a.jpg"),
         "a3.png": "has the same pixels as a2.png",
         "b2.jpg": "has the same pixels as b.jpg",
     }
@@ -498,6 +502,12 @@ def test_links_to_devices_pipes_and_pseudo_files_are_named_and_never_opened(fold
     [
         (lambda path: None, ["is empty"]),
         (lambda path: (path / "notes.txt").write_text("hello"), ["no photos", "1 other file"]),
+        (lambda path: (path / "f.mkv").write_bytes(b"film"), ["no photos", "f.mkv is a film in a container"]),
+        (
+            lambda path: save(path / "odm_dem/dsm.tif"),
+            ["no photos in", "odm_dem is a folder of OpenDroneMap's products"],
+        ),
+        (lambda path: (path / "f.zip").write_bytes(b"PK"), ["no photos", "f.zip is an archive"]),
         (lambda path: (path / "x.jpg").write_text("hello"), ["None of the 1 pictures", "x.jpg", "no JPEG"]),
         (lambda path: save(path / "x.jpg"), ["only one usable photo", "x.jpg"]),
         (
@@ -673,6 +683,23 @@ def test_masks_can_be_switched_off(folder: Path) -> None:
     (folder / "masks").mkdir()
     half_black(WIDTH, HEIGHT).save(folder / "masks" / "a.png")
     assert ingest(folder, masks=False).mask("a.jpg") is None
+
+
+def test_products_of_other_programs_and_earlier_runs_are_left_out_in_a_line(folder: Path) -> None:
+    (folder / "images").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        (folder / name).rename(folder / "images" / name)
+    for number, name in enumerate(("odm_orthophoto/odm_orthophoto.tif", "opensfm/undistorted/images/a.jpg.tif"), 5):
+        save(folder / name, number)
+    save(folder / "old run/stages/undistort-1/dataset/images/a.jpg", 7)
+    (folder / "old run/stages/format.json").write_text("{}")
+    result = ingest(folder)
+    assert set(result.photos) == {"images/a.jpg", "images/b.jpg"}
+    assert not any("uplicate" in warning or "same" in warning for warning in result.warnings)
+    assert result.notes == [
+        "Left out: odm_orthophoto, opensfm; each is a folder of OpenDroneMap's products.",
+        "Left out: old run is a folder of splatpipe's products.",
+    ]
 
 
 def test_colmap_folder_is_looked_for_photos_in_images(tmp_path: Path) -> None:

@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatpipe.pipeline.engine.errors import SplatpipeError
-from splatpipe.pipeline.engine.runs.source import ABSENT
+from splatpipe.pipeline.engine.runs.source import ABSENT, open_source
 from splatpipe.pipeline.engine.stage import Inputs, Summary
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.photos.files.photo_list import Photo, PhotoList, save_photo_list
@@ -33,12 +33,14 @@ class Notes:
     """A reporter that records."""
 
     warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def progress(self, done: int | float, total: int | float, what: str, unit: str = "") -> None: ...
 
     def metric(self, name: str, value: int | float, step: int | None = None) -> None: ...
 
-    def note(self, message: str) -> None: ...
+    def note(self, message: str) -> None:
+        self.notes.append(message)
 
     def warning(self, message: str, hint: str = "") -> None:
         self.warnings.append(message)
@@ -97,7 +99,7 @@ def write_model(scene: Survey, folder: Path, points: np.ndarray | None = None) -
         cam_from_model = pose @ TRUTH.rotation
         centre = model_from_world.apply(scene.centres[number - 1][None])[0]
         values = [*quaternion(cam_from_model), *(-cam_from_model @ centre)]
-        lines.append(f"{number} {' '.join(map(repr, map(float, values)))} 1 {name.replace(' ', '_')}\n\n")
+        lines.append(f"{number} {' '.join(map(repr, map(float, values)))} 1 {name}\n\n")
     (folder / "images.txt").write_text("".join(lines), encoding="utf-8")
     cloud = model_from_world.apply(GROUND if points is None else points)
     rows = [f"{i} {x!r} {y!r} {z!r} 9 9 9 0.5\n" for i, (x, y, z) in enumerate(cloud.tolist(), 1)]
@@ -144,9 +146,6 @@ def ingested(folder: Path, positions: list[dict[str, object]], names: list[str])
 def georef(
     scene: Survey, tmp_path: Path, photos: list[str] | None = None, **options: object
 ) -> tuple[Frame, Summary, list[str]]:
-    scene.names = [name.replace(" ", "_") for name in scene.names]  # COLMAP's text files end names at a blank
-    for record in scene.positions:
-        record["name"] = str(record["name"]).replace(" ", "_")
     model, out = tmp_path / "model", tmp_path / "out"
     write_model(scene, model)
     out.mkdir()
@@ -198,10 +197,10 @@ def test_wrong_positions_are_named_and_left_out(tmp_path: Path) -> None:
     for name in wrong:
         scene.at(name)["latitude"] = float(str(scene.at(name)["latitude"])) + 0.001  # 111 m
     frame, summary, warnings = georef(scene, tmp_path)
-    assert frame.left_out == tuple(name.replace(" ", "_") for name in wrong)
+    assert frame.left_out == tuple(wrong)
     assert summary["positions_left_out"] == 3
     assert errors_m(frame, scene).max() < 3.0
-    assert any(all(name.replace(" ", "_") in warning for name in wrong) for warning in warnings)
+    assert any(all(name in warning for name in wrong) for warning in warnings)
 
 
 def test_inaccurate_positions_are_reported_with_the_rms_of_the_table(tmp_path: Path) -> None:
@@ -227,10 +226,10 @@ def test_photos_without_position_and_positions_without_photo_do_no_harm(tmp_path
 def test_models_that_call_the_photos_otherwise_get_their_positions(tmp_path: Path) -> None:
     """A label without suffix, another case, a folder; but no position where several photos may be meant."""
     scene = survey(grid())
-    photos = [str(record["name"]).replace(" ", "_") for record in scene.positions]
+    photos = [str(record["name"]) for record in scene.positions]
     scene.names = [f"Camera/{name.upper()}" for name in photos[:10]] + [name.rpartition(".")[0] for name in photos[10:]]
     scene.names[29] = f"Camera/{scene.names[29]}"
-    frame, summary, _ = georef(scene, tmp_path / "a", [*photos, "spare/dji_029_ä.jpg"])
+    frame, summary, _ = georef(scene, tmp_path / "a", [*photos, "spare/dji 029 ä.jpg"])
     assert summary["positions_used"] == 29
     assert errors_m(frame, scene).max() < 3.5
     assert set(frame.residuals["photos"]) == set(photos[:29])
@@ -310,7 +309,6 @@ def test_invalid_model_is_refused(tmp_path: Path) -> None:
 
 def test_models_of_the_user_are_copied_and_never_linked(tmp_path: Path) -> None:
     scene = survey(grid())
-    scene.names = [name.replace(" ", "_") for name in scene.names]
     write_model(scene, tmp_path / "project" / "sparse")
     (tmp_path / "out").mkdir()
     parts = {"sparse.model": tmp_path / "project" / "sparse"} | ingested(tmp_path, [], scene.names)
@@ -320,7 +318,6 @@ def test_models_of_the_user_are_copied_and_never_linked(tmp_path: Path) -> None:
 
 def test_photos_that_a_model_of_the_user_has_and_its_folder_lacks_are_named(tmp_path: Path) -> None:
     scene = survey(grid())
-    scene.names = [name.replace(" ", "_") for name in scene.names]
     write_model(scene, tmp_path / "project" / "sparse")
     (tmp_path / "out").mkdir()
     parts = {"sparse.model": tmp_path / "project" / "sparse"} | ingested(tmp_path, [], [*scene.names[5:], "new.jpg"])
@@ -385,3 +382,19 @@ def test_points_without_marks_and_targets_leave_the_frame_to_the_positions(tmp_p
     frame, summary, warnings = georef(scene, tmp_path)
     assert frame.kind == "enu" and errors_m(frame, scene).max() < 0.1 and "control_points" not in summary
     assert any("without marks in photos" in text and "no targets were detected" in text for text in warnings)
+
+
+def test_of_several_models_the_one_that_is_used_is_said(tmp_path: Path) -> None:
+    scene = survey(grid())
+    project = tmp_path / "project"
+    (project / "images").mkdir(parents=True)
+    write_model(scene, project / "sparse/1")
+    write_model(replace(scene, names=scene.names[:2], cam_from_world=scene.cam_from_world[:2]), project / "sparse/0")
+    source = open_source(project, tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    parts = {"sparse.model": source.part_path("sparse.model")} | ingested(tmp_path, scene.positions, scene.names)
+    notes = Notes()
+    run(GeorefConfig(), Inputs(parts, project), tmp_path / "out", notes)
+    said = [note for note in notes.notes if "models in sparse/" in note]
+    assert len(said) == 1 and "sparse/1 with 30 photos is used; sparse/0 has 2" in said[0]
+    assert not any("not in the model" in warning for warning in notes.warnings)
