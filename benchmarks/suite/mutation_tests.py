@@ -48,7 +48,7 @@ NEAREST = 6  # test files that a mutation meets alone
 TIMEOUT_S = 300  # time limit of a test: a mutation may make a loop endless
 NO_TESTS = 5  # pytest's exit code
 FIRST = ("-x", "--max-worker-restart", "0")  # an endless loop ends its worker, and that is a failure, too
-FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)  # parameters may have blanks
 COMPARED = {ast.Lt: ">=", ast.GtE: "<", ast.Gt: "<=", ast.LtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
 COMPUTED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
 SIGNS = {ast.Lt: "<", ast.GtE: ">=", ast.Gt: ">", ast.LtE: "<=", ast.Eq: "==", ast.NotEq: "!="}
@@ -300,6 +300,8 @@ class Workshop:
         done = subprocess.run(
             command, cwd=self.clone, env=self.environment, capture_output=True, text=True, check=False
         )
+        if done.returncode == NO_TESTS and any("::" in name for name in tests):
+            raise SystemExit(f"pytest does not find one of {tests}")  # its workers only say that no tests ran
         if done.returncode in (0, NO_TESTS):
             return []
         return FAILED.findall(done.stdout) or [f"pytest ended with {done.returncode}: {done.stdout[-300:]}"]
