@@ -42,6 +42,7 @@ ALLOWED = {
     "pipeline/sfm/mapping/completion.py": "COLMAP's database",
     "pipeline/sfm/matching/keypoints.py": "COLMAP's database",
     "pipeline/sfm/recovery/ladder_growth.py": "COLMAP's database",
+    "pipeline/photos/colmap/colmap_text.py": "a copy of a model's text, in a new temporary folder",
     "pipeline/sfm/recovery/ladder_keypoints.py": "COLMAP's database, in a new temporary folder",
     "pipeline/sfm/recovery/ladder_pairs.py": "COLMAP's database, in a new temporary folder",
     "pipeline/sfm/pairing/layout.py": "COLMAP's database",
