@@ -644,6 +644,15 @@ def test_an_oblique_view_shows_all_of_a_box_from_above():
     assert camera.cam_from_world[1, 2] < 0.0  # up in the world is up in the picture
 
 
+@pytest.mark.parametrize("side", ["width", "height"])
+@pytest.mark.parametrize("pixels", [0, -3, 10**9])
+def test_cameras_of_absurd_size_are_ignored(run_folder: Path, tmp_path: Path, side: str, pixels: int):
+    listed = json.loads((run_folder / "cameras.json").read_text())
+    listed[2][side] = pixels
+    (tmp_path / "cameras.json").write_text(json.dumps(listed))
+    assert len(read_cameras(tmp_path / "cameras.json")) == len(listed) - 1
+
+
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"rotation": 5}]', "[" * 10_000, "[null]"])
 def test_damaged_cameras_are_ignored(tmp_path: Path, text):
     (tmp_path / "cameras.json").write_text(text)

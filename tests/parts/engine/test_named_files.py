@@ -133,7 +133,7 @@ def make_large(path: Path) -> None:
         (Path.exists, "does not exist"),
         (Path.mkdir, "is a folder"),
         (os.mkfifo, "not a regular file"),
-        (make_large, "too large"),
+        (make_large, "67 MB, too large"),
     ],
 )
 def test_an_unusable_named_file_is_reported(

@@ -310,3 +310,9 @@ def test_a_huge_record_is_not_read(out: Path) -> None:
     os.truncate(out / MEASURED, measurements.MAX_FILE_BYTES + 1)
     (surface,) = Store(out).artifacts("dsm")
     assert read_measurements(out, "volumes", surface.parts["dsm.files"].digest) == []
+
+
+@pytest.mark.parametrize("page", [b"<title>House</title>", PLAIN.replace(END, b""), BEGIN + b"null", b""])
+def test_a_page_without_a_whole_place_is_refused(page: bytes) -> None:
+    with pytest.raises(ValueError, match="no place for"):
+        with_measurements(page, {"sections": [], "volumes": []})

@@ -137,6 +137,7 @@ def test_scene_of_a_single_place_is_one_cell() -> None:
         (Frame("arbitrary", IDENTITY), box(1.0, 1.0), 0.02, "no metric scale"),
         (placed(), box(5000.0, 5000.0), 0.001, "too large"),
         (placed(), box(40_000.0, 0.1), 0.02, "too large"),
+        (placed(), box(3_000.0, 3_000.0), 0.01, "too large"),
         (placed(), box(10.0, 10.0), 0.0, "not valid for a surface"),
         (placed(), box(10.0, 10.0), float("nan"), "not valid for a surface"),
         (placed(), box(float("inf"), 10.0), 0.02, "no extent"),

@@ -17,6 +17,7 @@ from splatpipe.pipeline.survey.files.control_edit import ControlText
 from splatpipe.pipeline.survey.files.control_file import read_control_file
 from splatpipe.pipeline.survey.files.scale_bars import ScaleBar, read_scale_bars, scale_by
 from splatpipe.pipeline.survey.targets.constellation import overlay
+from splatpipe.pipeline.survey.targets.target_finds import WantedTargets
 from splatpipe.pipeline.survey.targets.target_marks import number_of
 
 FAMILIES = ("DICT_APRILTAG_36h11", "DICT_4X4_250", "DICT_6X6_250")
@@ -138,3 +139,8 @@ def test_control_file_with_points_only_accepts_marks_later(tmp_path: Path) -> No
     ControlText.read(path, lambda name: name).with_mark(point, "A.JPG", (7.0, 8.0)).save()
     first, second = read_control_file(path).points
     assert [(m.photo, m.x, m.y) for m in first.marks] == [("A.JPG", 7.0, 8.0)] and second.marks == ()
+
+
+def test_targets_are_wanted_for_points_and_for_scale_bars_alone() -> None:
+    bars, points = (ScaleBar("A", "B", 10.0, 0.002),), (("A", 1.0, 2.0, None),)
+    assert WantedTargets("", (), bars) and WantedTargets("", points, ()) and not WantedTargets("", (), ())

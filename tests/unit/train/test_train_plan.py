@@ -23,6 +23,7 @@ from splatpipe.pipeline.train.plan.plan import (
 from splatpipe.pipeline.train.plan.rates import Rates, rates_of
 from splatpipe.pipeline.train.plan.schedule import resolve_schedule
 from splatpipe.pipeline.train.plan.windows import TrainingSize
+from splatpipe.pipeline.train.state import memory
 from splatpipe.pipeline.train.state.checkpoint import (
     BrokenCheckpointError,
     Checkpoint,
@@ -225,3 +226,9 @@ def test_failed_save_keeps_the_previous_checkpoint(tmp_path: Path, monkeypatch: 
         save_checkpoint(path, "plan", Checkpoint({}, {"iteration": 2}))
     assert load_checkpoint(path, "plan").facts == {"iteration": 1}
     assert [item.name for item in tmp_path.iterdir()] == ["checkpoint.npz"]
+
+
+def test_memory_is_exceeded_only_above_a_limit() -> None:
+    assert memory.over_memory(TrainConfig(max_memory_bytes=1))
+    assert not memory.over_memory(TrainConfig(max_memory_bytes=1 << 44))
+    assert not memory.over_memory(TrainConfig(max_memory_bytes=0))
