@@ -571,6 +571,12 @@ def test_a_run_is_edited_from_the_command_line_and_stays_unchanged(run_folder: P
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["run", *made])
 
 
+def test_what_a_step_loses_is_told(run_folder: Path, tmp_path: Path):
+    output, recorder = OutputFile(tmp_path / "a.ply", format_named("ply")), Recorder()
+    edit_splat(EditTask(open_source(run_folder), output, parse_steps([("scale", "2")], output, False)), recorder)
+    assert [text for text in recorder.warnings if "drops the splat's georeference" in text]
+
+
 def test_errors_leave_nothing_behind_and_say_what_to_do(run_folder: Path, tmp_path: Path):
     output = splatpipe_edit(run_folder, tmp_path / "a.ply", "--crop-box", "0,0,1,1")
     assert output["exit_code"] == 1 and "would remove the whole splat" in output["error"]["message"]
