@@ -325,20 +325,26 @@ def meet_nearest(workshop: Workshop, reach: Reach, mutation: Mutation) -> Findin
     return finding
 
 
+def _failures_of(workshop: Workshop, findings: Sequence[Finding], tests: Sequence[str], *, first: bool) -> list[str]:
+    """The failures of tests on mutations, which are taken back whatever happens."""
+    mutations = [each.mutation for each in findings]
+    workshop.change(mutations)
+    try:
+        return workshop.failures(tests, first=first)
+    finally:
+        workshop.restore(mutations)
+
+
 def meet_all(workshop: Workshop, findings: Sequence[Finding], tests: Sequence[str], ring: str) -> None:
     """Run tests on all mutations that were not noticed, together, and tell which of these each failure notices."""
     begin = time.monotonic()
     while left := [each for each in findings if not each.ring]:
-        workshop.change([each.mutation for each in left])
-        failed = workshop.failures(tests, first=False)
-        workshop.restore([each.mutation for each in left])
+        failed = _failures_of(workshop, left, tests, first=False)
         if not failed:
             break
         print(f"{len(left)} together: {len(failed)} failures, such as {failed[0]}", flush=True)
         for finding in left:
-            workshop.change([finding.mutation])
-            alone = workshop.failures(failed, first=True)
-            workshop.restore([finding.mutation])
+            alone = _failures_of(workshop, [finding], failed, first=True)
             if alone:
                 finding.ring, finding.test = ring, alone[0]
         assert any(each.ring for each in left), f"only together: {failed}"

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from measure import SilentReporter
 from position_scenes import STATED_M, stated_positions
 from tables import Row, print_table
 
@@ -38,18 +39,6 @@ COLUMNS = {
     **{f"/sigma {axis}": f"sigma_{axis}:.2f" for axis in AXES},
     **{f"held {axis}": f"held_{axis}:.2f" for axis in AXES},
 }
-
-
-class Quiet:
-    """Reports nothing."""
-
-    def progress(self, done: float, total: float, what: str, unit: str = "") -> None: ...
-
-    def metric(self, name: str, value: float, step: int | None = None) -> None: ...
-
-    def note(self, message: str) -> None: ...
-
-    def warning(self, message: str, hint: str = "") -> None: ...
 
 
 def drawn_positions(stated: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -83,7 +72,7 @@ def placed_anew(folder: RunFolder, photos_dir: Path, seed: int) -> tuple[Float64
         parts["ingest.positions"] = work / "positions.json"
         parts["ingest.positions"].write_text(json.dumps(drawn_positions(whole, seed)), "utf-8")
         config = GeorefConfig(check_points=",".join(names))
-        georef(config, Inputs(parts, photos_dir, {"sparse.lens": "auto"}), work, Quiet())
+        georef(config, Inputs(parts, photos_dir, {"sparse.lens": "auto"}), work, SilentReporter())
         points = json.loads((work / "control.json").read_text("utf-8"))["points"]
         accuracy = json.loads((work / "accuracy.json").read_text("utf-8"))
     return np.array([point["residual_m"] for point in points]), accuracy

@@ -15,7 +15,7 @@ RUN_MARK = Path("stages", "format.json")  # in every OUT of splatpipe
 def program_of(folder: Path) -> str:
     """The program whose results a folder holds; empty for any other folder.
 
-    OpenDroneMap's are told by their names, which nobody else uses; a run of splatpipe by the file that marks it.
+    OpenDroneMap's are told by their names alone, so a note names what is left out; a run of splatpipe by its mark.
     """
     if folder.name in ODM_FOLDERS:
         return "OpenDroneMap"
