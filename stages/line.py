@@ -53,7 +53,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=9,
+    version=10,
     config=SparseConfig,
     reads=(
         "matches.database",

@@ -172,7 +172,7 @@ def _warn(summary: Mapping[str, JSON], report: Reporter) -> None:
             report.warning(f"{bad}{reason['text']}", reason["hint"])
     if any(row.get("focal_held") for row in summary["tried"] if row["chosen"]):
         report.warning(
-            "Photos of flat ground from one height cannot determine the focal length: it is kept within 3 % of the "
-            "metadata's.",
-            hint="Add oblique photos, or a second flying height, for reliable heights.",
+            "The photos do not determine the focal length, as of flat ground from one height, or along a straight "
+            "street: it is kept within 3 % of the metadata's.",
+            hint="Add oblique photos, a second flying height, or photos from the other side, for reliable sizes.",
         )

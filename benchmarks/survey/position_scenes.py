@@ -1,7 +1,7 @@
 """Flights with known cameras, ground and position errors, drawn from a seed; geometry only, nothing is rendered.
 
-Strips of 48 photos straight down from 44 m (GSD 2.3 cm), and the demo's oblique photos of a house, which is a box here.
-World: east, north, up in metres.
+Strips of 48 photos straight down from 44 m (GSD 2.3 cm), a large block of 1,120, and the demo's oblique photos of a
+house, which is a box here. World: east, north, up in metres.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ from splatpipe.pipeline.survey.adjustment.position_noise import StatedPositions
 from splatpipe.pipeline.survey.adjustment.tie_points import intersected
 
 SCENES = ("flat", "relief", "alternating", "one heading", "demo")
+LARGE = "large"  # flat, too; takes minutes, so it is drawn only on request
 FAULTS = ("none", "wrong", "no fix", "datum", "too small", "too large")
 STRIPS, PER_STRIP, ALONG, ACROSS = 6, 8, 0.8, 0.7  # photos, and their overlaps
+LARGE_STRIPS, LARGE_PER_STRIP = 28, 40
 HEIGHT_M, FOCAL_PX, SIZE_PX = 44.0, 1920.0, (1600, 1300)
 APART_M, RELIEF_M = 8.0, 5.0  # between the heights of alternating strips; of the hills, from foot to top
 # Standard deviations of the aircraft's place and tilt about its plan.
 STEADY_M, TILT_DEG = np.array([0.2, 0.2, 0.1]), 0.5
 TIES_PER_PHOTO, TIE_PX = 150, 1.0  # tie points per photo, and standard deviation of their noise
-CANDIDATES = 5000
+CANDIDATES, PER_PHOTO = 5000, 14  # points drawn, and more of many photos
 MAX_RAY_TANGENT = 0.9  # tangent of a ray's angle up to which the lens is drawn
 MATCHED = math.cos(math.radians(30.0))  # a point is matched among rays that differ by less
 GRAZING = math.cos(math.radians(72.0))
@@ -74,11 +76,11 @@ def draw_scene(name: str, fault: str, seed: int) -> Scene:
     """Draw a scene; all but the fault is the same for one name and seed.
 
     Args:
-        name: One of ``SCENES``.
+        name: One of ``SCENES``, or ``LARGE``.
         fault: One of ``FAULTS``.
         seed: Of everything drawn.
     """
-    rng = np.random.default_rng([SCENES.index(name), seed])
+    rng = np.random.default_rng([(*SCENES, LARGE).index(name), seed])
     truth = json.loads((CAPTURE / "truth.json").read_text(encoding="utf-8"))
     if name == "demo":
         rotations = np.array([photo["cam_from_world"] for photo in truth["photos"]])[:, :3, :3]
@@ -111,10 +113,11 @@ def draw_scene(name: str, fault: str, seed: int) -> Scene:
 
 def _strips(name: str, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]:
     """Cameras of strips to and fro, the longer side of the photos across them."""
-    strip, place = np.divmod(np.arange(STRIPS * PER_STRIP), PER_STRIP)
+    strips, per_strip = (LARGE_STRIPS, LARGE_PER_STRIP) if name == LARGE else (STRIPS, PER_STRIP)
+    strip, place = np.divmod(np.arange(strips * per_strip), per_strip)
     back = strip % 2 == 1
-    along = np.where(back, -1.0, 1.0) * (place - 0.5 * (PER_STRIP - 1)) * (1.0 - ALONG) * SIZE_PX[1]
-    across = (strip - 0.5 * (STRIPS - 1)) * (1.0 - ACROSS) * SIZE_PX[0]
+    along = np.where(back, -1.0, 1.0) * (place - 0.5 * (per_strip - 1)) * (1.0 - ALONG) * SIZE_PX[1]
+    across = (strip - 0.5 * (strips - 1)) * (1.0 - ACROSS) * SIZE_PX[0]
     level = HEIGHT_M + (APART_M * (0.5 - back) if name == "alternating" else np.zeros(len(strip)))
     centres = np.column_stack([across * HEIGHT_M / FOCAL_PX, along * HEIGHT_M / FOCAL_PX, level])
     turned = np.where(back & (name != "one heading"), -1.0, 1.0)
@@ -141,10 +144,11 @@ def _ground(
 ) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, "p 3"]]:
     """Points of the ground below a flight, and its normals, which are upright."""
     reach = np.abs(centres[:, :2]).max(axis=0) + 0.5 * HEIGHT_M
-    plan = rng.uniform(-reach, reach, (CANDIDATES, 2))
+    count = max(CANDIDATES, PER_PHOTO * len(centres))
+    plan = rng.uniform(-reach, reach, (count, 2))
     heights = np.sin(plan @ (0.1 * rng.normal(size=(2, 4))) + rng.uniform(0.0, 2.0 * math.pi, 4)).sum(axis=1)
     heights = relief_m * ((heights - heights.min()) / np.ptp(heights) - 0.5)
-    return np.column_stack([plan, heights]), np.tile([0.0, 0.0, 1.0], (CANDIDATES, 1))
+    return np.column_stack([plan, heights]), np.tile([0.0, 0.0, 1.0], (count, 1))
 
 
 def _garden(yaw: float, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, "p 3"]]:

@@ -180,7 +180,8 @@ def _first(work: Reconstructor) -> MappingAttempt:
     if work.config.mapper == "auto" and best.placed < MAX_SHARE * total:
         placed = f"{best.placed} of {total} photos placed" if best.placed else "no photo was placed"
         work.notes[best] = f"doubtful: {placed}"
-        best = _better(best, work.map_further("global", "global"))
+        again = work.map if best.placed < ENOUGH_SHARE * total else work.map_further  # so few are no doubtful model yet
+        best = _better(best, _with_held_focal(work, again("global", "global")))
     if best.placed < ENOUGH_SHARE * total and work.config.mapper != "global":
         best = _better(best, work.map("incremental", "incremental, relaxed thresholds", relaxed=True))
     return best
@@ -259,12 +260,13 @@ def _rejudge(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
 
 
 def _with_held_focal(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
-    """Return the attempt, or one with the focal length held near its prior if the photos do not determine it.
+    """Return the attempt, or one with the focal length held near its prior if it strayed from that without need.
 
-    In that case the held focal length explains the matches just as well.
+    That is where the photos do not determine it, or where it contradicts a reliable value; the held focal length has to
+    explain the matches just as well.
     """
     enough = answer.placed >= ENOUGH_SHARE * len(work.verified.names)  # a small model says nothing about the lens
-    if not enough or not work.further or not _focal_unobserved(answer.models[0], work.verified.cameras):
+    if not enough or not work.further or not _focal_in_doubt(answer, work.verified.cameras):
         return answer
     held = work.map_further(answer.mapper, f"{answer.how}, focal length held", hold_focal=True)
     if held.placed < answer.placed:
@@ -309,14 +311,17 @@ def _has_points(model: Model) -> bool:
     return bool(model.compute_num_observations() >= MIN_SEEN * model.num_reg_images())
 
 
-def _focal_unobserved(model: Model, priors: Mapping[int, pycolmap.Camera]) -> bool:
-    """Whether a focal length left its prior although the photos do not determine it; ground control may, later."""
+def _focal_in_doubt(answer: MappingAttempt, priors: Mapping[int, pycolmap.Camera]) -> bool:
+    """Whether a focal length left its prior, and the photos do not determine it, or the prior is reliable."""
+    model = answer.models[0]
     used = _used(model)
     strayed = [
         number for number in used if _focal_deviation(model.cameras[number], priors[number]) >= MAX_UNOBSERVED_DEVIATION
     ]
     if not strayed or not all(priors[number].has_prior_focal_length for number in used):
         return False
+    if answer.judgement is not None and any(reason.kind == "focal" for reason in answer.judgement.reasons):
+        return True
     sigmas = focal_sigmas(model)
     return any(sigmas.get(number, math.inf) > UNOBSERVED for number in strayed)
 

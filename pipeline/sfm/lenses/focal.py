@@ -17,9 +17,11 @@ import pyceres
 import pycolmap
 
 from splatpipe.pipeline.sfm.lenses.lens_blocks import keep_shape
+from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 
 UNOBSERVED = 0.01  # relative standard deviation above which the photos do not determine a focal length
 PRINCIPAL_POINT_SIGMA = 0.01  # prior standard deviation of the principal point over the image width
+ROBUST_PX = 1.0  # scale of the loss
 MAX_DENSE = 60  # photos up to which the reduced system is solved densely
 MAX_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6
@@ -70,7 +72,10 @@ def adjust_within(model: pycolmap.Reconstruction, focals: Mapping[int, float], s
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(pycolmap.BundleAdjustmentOptions(), config, model)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY  # as in the last adjustment of mapping
+    options.ceres.loss_function_scale = ROBUST_PX * pixel_tolerance_scale(model.cameras.values())
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     kept = [keep_shape(adjuster.problem, camera) for _, camera in sorted(model.cameras.items())]
     for number, focal in sorted(focals.items()):
         keep_near(adjuster.problem, model.cameras[number], focal, share)

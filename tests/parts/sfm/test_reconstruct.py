@@ -68,6 +68,36 @@ def test_auto_uses_the_other_mapper_if_the_first_one_fails(weak: tuple[Ring, Map
     assert "doubtful" in first["why"] and first["placed"] < 12
 
 
+def test_the_other_mappers_focal_length_is_held_as_well_if_the_photos_do_not_determine_it(
+    weak: tuple[Ring, MappingInput], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatpipe.pipeline.sfm.reconstruct.UNOBSERVED", 1e-12)
+    monkeypatch.setattr("splatpipe.pipeline.sfm.reconstruct.MAX_UNOBSERVED_DEVIATION", 1e-6)
+    found = reconstruct(weak[1], SparseConfig(), corner_photos.Recorder())
+    assert [(row["how"], row["chosen"]) for row in found.tried] == [
+        ("incremental", False),
+        ("global", False),
+        ("global, focal length held", True),
+    ]
+    assert far_off(weak[0], found.model) < 0.005
+
+
+def test_a_reliable_focal_length_is_held_only_if_it_explains_the_matches_as_well(tmp_path: Path) -> None:
+    ring = make_ring(count=12, points=500, most=300)
+    capture = capture_of(ring, tmp_path / "capture")
+    with pycolmap.Database.open(capture.database) as database:
+        [lens] = database.read_all_cameras()
+        true = lens.focal_length
+        lens.params = np.array([1.15 * true, *lens.params[1:]])
+        database.update_camera(lens)
+    found = reconstruct(capture, SparseConfig(), corner_photos.Recorder())
+    assert [(row["how"], row["chosen"]) for row in found.tried] == [
+        ("incremental", True),
+        ("incremental, focal length held", False),
+    ]
+    assert abs(found.model.cameras[1].focal_length - true) < 0.01 * true
+
+
 def test_photos_from_one_spot_are_not_placed_without_points(tmp_path: Path) -> None:
     ring = make_ring(count=16, reach=3, points=3000, most=120, one_spot=True)
     with pytest.raises(SplatpipeError, match="None of 16 photos could be placed") as refused:
