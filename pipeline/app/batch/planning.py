@@ -168,7 +168,8 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
         planned = _with_previous_failure(planned, first, request.out)
     if names and not planned.message:
         planned = _with_input_error(planned, request, settings)
-    memory, speed = available_memory_bytes() if settings.local else 0, machine_speed()
+    memory = available_memory_bytes() if settings.local else settings.node_memory_bytes
+    speed = machine_speed()
 
     def forecast(threads: int) -> RunForecast:
         return RunForecast.of(size, config, threads, memory)
@@ -264,9 +265,16 @@ def _with_jobs(draft: _CaptureDraft, threads: int, settings: Settings) -> Planne
     jobs = [stage_job(name, needs[name], threads, local=settings.local) for name in draft.names]
     if not settings.local:  # a stage that is turned off needs no job: the next one's command passes it
         jobs = [job for job in jobs if needs[job.stage].memory_bytes] or jobs[-1:]
-        jobs = _joined(jobs, gpu=settings.gpu, divided=draft.divided)
+        jobs = _joined(_with_room_to_decide(jobs), gpu=settings.gpu, divided=draft.divided)
     weights = {name: need.seconds(threads) for name, need in needs.items()}
     return replace(draft.planned, jobs=tuple(jobs), weights=weights)
+
+
+def _with_room_to_decide(jobs: Sequence[StageJob]) -> list[StageJob]:
+    """Let a stage that counts shards request what the stage with shards does: it decides by its own job's memory."""
+    asked = {job.stage: job.memory_bytes for job in jobs}
+    needed = {stage_name(each.shards.counted_by): asked.get(each.name, 0) for each in LINE if each.shards is not None}
+    return [replace(job, memory_bytes=max(job.memory_bytes, needed.get(job.stage, 0))) for job in jobs]
 
 
 def _joined(jobs: Sequence[StageJob], *, gpu: bool, divided: bool) -> list[StageJob]:

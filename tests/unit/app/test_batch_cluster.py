@@ -235,6 +235,18 @@ def test_a_stage_waits_for_its_shards_only_where_another_job_counts_them(tmp_pat
     assert waited == [divided.key]
 
 
+def test_training_is_forecast_for_the_largest_node_and_the_stage_that_decides_on_blocks_has_its_memory(
+    tmp_path: Path,
+) -> None:
+    asked = []
+    for node_bytes in (2_000_000_000, 64_000_000_000):
+        plan = plan_of(tmp_path / str(node_bytes), Settings("high", local=False, node_memory_bytes=node_bytes))
+        memory = {job.stage: job.memory_bytes for job in plan.captures[0].jobs}
+        assert memory["blocks"] >= memory["train"]
+        asked.append(memory["train"])
+    assert asked[0] < asked[1]
+
+
 def test_a_gpu_is_requested_only_by_jobs_that_use_it(tmp_path: Path) -> None:
     (capture,) = plan_of(tmp_path, Settings("preview", local=False, gpu=True)).captures
     jobs = {name: [job.stage for job in each] for name, each in workflow_jobs(capture.jobs).items()}
