@@ -16,6 +16,7 @@ STAGE = "features"
 # Long enough to be disturbed: the preset's extractor would take a second.
 OPTIONS = ("--preset", "preview", "--until", STAGE, "--set", "features.extractor=sift", "--threads", "1")
 PHOTOS = 8
+PAGE_S = 30.0
 MARKS = (b"splatpipe", b"snakemake", b"srun")  # in the command lines of a job's processes
 SLURMS = b"slurmstepd"  # without it Slurm takes the host for dead, and requeues the job
 
@@ -138,13 +139,14 @@ def drained(night: Night) -> None:
         reason = batch.wait_for(
             "Slurm's reason", lambda: (batch.out / "batch.json").exists() and batch.capture()["reason"]
         )
-        page = (batch.out / "batch.html").read_text(encoding="utf-8")
+        page = batch.out / "batch.html"  # written after batch.json
+        batch.wait_for("its page", lambda: "down or drained" in page.read_text(encoding="utf-8"), PAGE_S)
     finally:
         for host in HOSTS:
             night.cluster.run("scontrol", "update", f"nodename={host}", "state=resume")
     night.say(f"while it waits: {reason}")
-    if "down or drained" not in reason or "down or drained" not in page:
-        raise Problem("The page has to say that the nodes are drained.")
+    if "down or drained" not in reason:
+        raise Problem("It has to be told that the nodes are drained.")
     _must_succeed(night, batch)
 
 

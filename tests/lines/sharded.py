@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 from arithmetic import READ, ReadConfig
 
@@ -116,6 +117,8 @@ class Forecaster:
 
 class RunForecast:
     """A hundred million bytes a stage; half of the disk's and a tenth of the time for the third shard."""
+
+    training = SimpleNamespace(division=None)
 
     @staticmethod
     def of(_size: object, _config: LineConfig, _threads: int = 1, _machine_bytes: int = 0) -> "RunForecast":

@@ -88,6 +88,7 @@ class _CaptureDraft:
         names: Those of them that are not valid.
         forecast_needs: Returns each stage's need for a number of threads.
         shards: Missing shards by stage, for those of ``names`` whose number of shards is known.
+        divided: Whether shards are missing, or are expected to be.
     """
 
     planned: PlannedCapture
@@ -95,6 +96,7 @@ class _CaptureDraft:
     names: tuple[str, ...] = ()
     forecast_needs: Callable[[int], Mapping[str, Need]] = field(default=lambda _threads: {})
     shards: Mapping[str, Sequence[Shard]] = field(default_factory=dict)
+    divided: bool = False
 
 
 def make_plan(captures: Sequence[ListedCapture], call: Call, settings: Settings) -> BatchPlan:
@@ -166,15 +168,18 @@ def _resolve_capture(capture: ListedCapture, planned: PlannedCapture, call: Call
         planned = _with_previous_failure(planned, first, request.out)
     if names and not planned.message:
         planned = _with_input_error(planned, request, settings)
-    memory, speed = available_memory_bytes() if settings.local else 0, machine_speed()
+    memory = available_memory_bytes() if settings.local else settings.node_memory_bytes
+    speed = machine_speed()
 
-    def forecast_needs(threads: int) -> Mapping[str, Need]:
-        return RunForecast.of(size, config, threads, memory).needs(speed)
+    def forecast(threads: int) -> RunForecast:
+        return RunForecast.of(size, config, threads, memory)
 
     # If the stage that counts the shards has to run, it will determine their number.
     first_stages = [each for each in statuses if each.stage.name in names] if first else []
     shards = {} if planned.message else missing_shards(first_stages)
-    return _CaptureDraft(planned, tuple(needed), () if planned.message else names, forecast_needs, shards)
+    divided = any(shards.values()) or forecast(1).training.division is not None
+    names = () if planned.message else names
+    return _CaptureDraft(planned, tuple(needed), names, lambda threads: forecast(threads).needs(speed), shards, divided)
 
 
 def _with_input_error(planned: PlannedCapture, request: Request, settings: Settings) -> PlannedCapture:
@@ -259,24 +264,33 @@ def _with_jobs(draft: _CaptureDraft, threads: int, settings: Settings) -> Planne
     needs = _needs_of(draft, threads, draft.needed)
     jobs = [stage_job(name, needs[name], threads, local=settings.local) for name in draft.names]
     if not settings.local:  # a stage that is turned off needs no job: the next one's command passes it
-        jobs = _joined([job for job in jobs if needs[job.stage].memory_bytes] or jobs[-1:], settings.gpu)
+        jobs = [job for job in jobs if needs[job.stage].memory_bytes] or jobs[-1:]
+        jobs = _joined(_with_room_to_decide(jobs), gpu=settings.gpu, divided=draft.divided)
     weights = {name: need.seconds(threads) for name, need in needs.items()}
     return replace(draft.planned, jobs=tuple(jobs), weights=weights)
 
 
-def _joined(jobs: Sequence[StageJob], gpu: bool) -> list[StageJob]:
+def _with_room_to_decide(jobs: Sequence[StageJob]) -> list[StageJob]:
+    """Let a stage that counts shards request what the stage with shards does: it decides by its own job's memory."""
+    asked = {job.stage: job.memory_bytes for job in jobs}
+    needed = {stage_name(each.shards.counted_by): asked.get(each.name, 0) for each in LINE if each.shards is not None}
+    return [replace(job, memory_bytes=max(job.memory_bytes, needed.get(job.stage, 0))) for job in jobs]
+
+
+def _joined(jobs: Sequence[StageJob], *, gpu: bool, divided: bool) -> list[StageJob]:
     """Join light stages that follow one another into one job each.
 
-    A stage with shards has jobs of its own, and one that counts them ends its job, so that they can start. Stages with
+    If there are shards, they have jobs of their own, as has their stage, and the stage that counts them ends its job,
+    so that they can start. If there are more than expected, the joined job runs them one after the other. Stages with
     and without a GPU are not joined.
     """
-    sharded = {stage.name for stage in LINE if stage.shards is not None}
+    sharded = {stage.name for stage in LINE if stage.shards is not None} if divided else set()
     return [
         replace(
             job,
             joined=max(job.seconds, after.seconds) < LIGHT_S
             and not {job.stage, after.stage} & sharded
-            and not counts_shards(job.stage, LINE)
+            and not (divided and counts_shards(job.stage, LINE))
             and not (gpu and (job.stage in GPU_STAGES) != (after.stage in GPU_STAGES)),
         )
         for job, after in pairwise(jobs)

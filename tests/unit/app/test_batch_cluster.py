@@ -1,5 +1,6 @@
 """A batch whose jobs run elsewhere: what they request, and what is known of them once their engine has ended them."""
 
+import asyncio
 import json
 import logging
 import sys
@@ -203,18 +204,53 @@ def test_a_job_elsewhere_requests_memory_for_what_starts_it_and_one_that_is_off_
     assert max(job.threads for job in plan.captures[0].jobs) == 2
 
 
-def test_light_stages_share_a_job_and_those_with_shards_have_their_own(tmp_path: Path) -> None:
+def test_light_stages_share_a_job(tmp_path: Path) -> None:
     (capture,) = plan_of(tmp_path, Settings("preview", local=False)).captures
     jobs = workflow_jobs(capture.jobs)
-    assert list(jobs)[:2] == ["blocks", "train"] and len(jobs) == 3
-    assert [job.stage for job in jobs["train"]] == ["train"]
+    assert list(jobs) == ["publish"] and [job.stage for job in jobs["publish"]] == [job.stage for job in capture.jobs]
+
+
+def test_shards_their_stage_and_the_one_that_counts_them_have_their_own_jobs(tmp_path: Path) -> None:
+    (capture,) = plan_of(tmp_path, Settings("preview", local=False, tables=({"blocks": {"least": 2}},))).captures
+    jobs = workflow_jobs(capture.jobs)
+    assert list(jobs) == ["blocks", "train", "publish"] and [job.stage for job in jobs["train"]] == ["train"]
     assert [job.stage for each in jobs.values() for job in each] == [job.stage for job in capture.jobs]
+
+
+def test_a_stage_waits_for_its_shards_only_where_another_job_counts_them(tmp_path: Path) -> None:
+    both = replace(planned("house"), jobs=(small("blocks", joined=True), small("train"), small("publish")))
+    divided = replace(planned("barn"), jobs=(small("blocks"), small("train")))
+    text = workflow_text(call_of(tmp_path, both, divided), BatchPlan(str(tmp_path), 1.0, (both, divided)), LINE)
+    assert 'joined(wildcards, "train", "blocks")' in text and "checkpoint blocks:" in text
+    waited: list[str] = []
+
+    def get(capture: str) -> None:
+        waited.append(capture)
+
+    names: dict[str, Any] = {"checkpoints": SimpleNamespace(blocks=SimpleNamespace(get=get))}
+    exec(text[text.index("JOBS =") : text.index("def memory")], names)
+    exec(text[text.index("def before") : text.index("wildcard_constraints")], names)
+    for capture in (both, divided):
+        names["joined"](SimpleNamespace(capture=capture.key), "train", "blocks")
+    assert waited == [divided.key]
+
+
+def test_training_is_forecast_for_the_largest_node_and_the_stage_that_decides_on_blocks_has_its_memory(
+    tmp_path: Path,
+) -> None:
+    asked = []
+    for node_bytes in (2_000_000_000, 64_000_000_000):
+        plan = plan_of(tmp_path / str(node_bytes), Settings("high", local=False, node_memory_bytes=node_bytes))
+        memory = {job.stage: job.memory_bytes for job in plan.captures[0].jobs}
+        assert memory["blocks"] >= memory["train"]
+        asked.append(memory["train"])
+    assert asked[0] < asked[1]
 
 
 def test_a_gpu_is_requested_only_by_jobs_that_use_it(tmp_path: Path) -> None:
     (capture,) = plan_of(tmp_path, Settings("preview", local=False, gpu=True)).captures
     jobs = {name: [job.stage for job in each] for name, each in workflow_jobs(capture.jobs).items()}
-    assert jobs["blocks"] == ["blocks"] and jobs["evaluate"] == ["clean", "evaluate"]
+    assert jobs["initialize"][-1] == "initialize" and jobs["evaluate"] == ["blocks", "train", "clean", "evaluate"]
 
 
 def test_a_long_stage_has_a_job_of_its_own(tmp_path: Path) -> None:
@@ -374,3 +410,25 @@ def test_an_error_whose_text_is_on_the_next_line_is_told_with_it(tmp_path: Path)
     call = Call(tmp_path)
     call.snakemake_log.write_text("Building\nWorkflowError:\nAt least one job did not complete successfully.\n")
     assert snakemake_process.last_error_line(call) == "WorkflowError: At least one job did not complete successfully."
+
+
+@pytest.mark.parametrize(("plugins_own", "slept"), [(5, 5), (180, 10)])
+def test_an_executor_polls_as_often_as_snakemake_is_set_to(
+    monkeypatch: pytest.MonkeyPatch, plugins_own: int, slept: int
+) -> None:
+    from snakemake_interface_executor_plugins.executors.remote import RemoteExecutor
+
+    found = []
+
+    async def sleep(seconds: float) -> None:
+        found.append(seconds)
+
+    monkeypatch.setattr(RemoteExecutor, "sleep", None)
+    monkeypatch.setattr(snakemake_process.asyncio, "sleep", sleep)
+    snakemake_process.limit_poll_intervals()
+    settings = SimpleNamespace(seconds_between_status_checks=10)
+    executor: Any = SimpleNamespace(
+        workflow=SimpleNamespace(remote_execution_settings=settings), next_seconds_between_status_checks=plugins_own
+    )
+    asyncio.run(RemoteExecutor.sleep(executor))
+    assert found == [slept]

@@ -8,6 +8,7 @@ not outlive us.
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import os
 import pwd
@@ -22,6 +23,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from splatpipe.pipeline.app.batch.jobs.job import end_with_parent
 from splatpipe.pipeline.app.batch.jobs.job_errors import record_errors
@@ -209,8 +211,25 @@ def last_error_line(call: Call) -> str:
     return ""
 
 
+def limit_poll_intervals() -> None:
+    """Keep the executor of the Snakemake that will run in this process asking as often as Snakemake is set to.
+
+    Slurm's plugin ignores ``--seconds-between-status-checks`` and lets its intervals grow to three minutes, by which
+    the next job starts later; Slurm may even have forgotten the job by then.
+    """
+    from snakemake_interface_executor_plugins.executors.remote import RemoteExecutor
+
+    RemoteExecutor.sleep = _sleep_until_next_poll
+
+
+async def _sleep_until_next_poll(executor: Any) -> None:
+    most = executor.workflow.remote_execution_settings.seconds_between_status_checks
+    await asyncio.sleep(min(executor.next_seconds_between_status_checks, most))
+
+
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     end_with_parent()
     record_errors(Path.cwd())
+    limit_poll_intervals()
     runpy.run_module("snakemake", run_name="__main__", alter_sys=True)

@@ -66,8 +66,10 @@ def shards(capture, stage):
 
 
 def joined(wildcards, stage, counted):
+    if counted not in JOBS[wildcards.capture]:  # one job runs both stages
+        return before(wildcards, stage)
     if shards(wildcards.capture, stage) is None:
-        counted.get(capture=wildcards.capture)
+        getattr(checkpoints, counted).get(capture=wildcards.capture)
     names = shards(wildcards.capture, stage) or {{}}
     return [*before(wildcards, stage), *(f"{done}/{{wildcards.capture}}/{{name}}" for name in names)]
 """
@@ -122,7 +124,7 @@ def workflow_text(call: Call, plan: BatchPlan, stages: Sequence[Stage]) -> str:
         if stage.shards is not None:
             divided = True
             rules.append(_shard_rule(stage.name, rule, after))
-            after = f'joined(wildcards, "{stage.name}", checkpoints.{stage_name(stage.shards.counted_by)})'
+            after = f'joined(wildcards, "{stage.name}", "{stage_name(stage.shards.counted_by)}")'
         names = {"name": stage.name, "output": stage.name, "output_name": stage.name}
         own = f'JOBS[wildcards.capture]["{stage.name}"]'
         rules.append(_RULE.format(**rule, **names, kind=kind, after=after, jobs=own))
