@@ -3,6 +3,7 @@ them."""
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
@@ -19,6 +20,9 @@ THEIR_AXES: Axes = "y down"
 """Axes that splat-transform assumes for a PLY; SPZ and glTF, which are y up, it converts to these and back."""
 _ENDINGS = {"compressed-ply": ".compressed.ply", "spz": ".spz", "sog": ".sog", "glb": ".glb", "ply": ".ply"}
 _OPTIONS = {"spz": ("--spz-version", "3"), "sog": ("-g", "cpu"), "streamed-sog": ("-g", "cpu")}
+_SOG_ITERATIONS = 10  # splat-transform's default
+_SOG_PALETTE = 64  # thousands of entries, at most: as it chooses them
+_SOG_S_PER_PAIR = 5.3e-8  # measured: CPU seconds a Gaussian and palette entry, of one iteration without a GPU
 
 
 @dataclass(frozen=True)
@@ -74,16 +78,17 @@ class OtherPrograms:
         """Whether splat-transform reads a format of ours."""
         return name in (*_ENDINGS, "spz2", "model", "viewer-ply", "streamed-sog") and name != "glb"
 
-    def write(self, name: str, source: Path, folder: Path) -> tuple[Path, ProgramEnd]:
+    def write(self, name: str, source: Path, folder: Path, *options: str) -> tuple[Path, ProgramEnd]:
         """Convert a PLY with splat-transform to a format of ours.
 
         Args:
             name: Name of the format.
             source: A PLY in their axes.
             folder: Output folder.
+            options: Further options of splat-transform.
         """
         target = folder / f"theirs{_ENDINGS[name]}"
-        return target, self.convert(source, target, *_OPTIONS.get(name, ()))
+        return target, self.convert(source, target, *_OPTIONS.get(name, ()), *options)
 
     def read(self, path: Path) -> Scene:
         """Read a file with splat-transform; the scene is in its axes.
@@ -95,6 +100,25 @@ class OtherPrograms:
             plain = Path(folder) / "read.ply"
             self.convert(path, plain)
             return Scene(read_splat(plain), SceneFacts(THEIR_AXES))
+
+
+def sog_iterations(gaussians: int, limit_s: float) -> int:
+    """How many iterations of its palette's k-means splat-transform's SOG writer makes in a time.
+
+    Without a GPU it looks for each Gaussian's nearest palette entry in a k-d tree of 45 dimensions, hence at nearly all
+    entries: 10 iterations for 130,000 Gaussians take more than an hour.
+
+    Args:
+        gaussians: Number of Gaussians, of SH degree 3.
+        limit_s: CPU seconds.
+
+    Returns:
+        Its default of 10, or fewer; 0 if a single one takes longer.
+    """
+    if gaussians < 1024:
+        return _SOG_ITERATIONS
+    palette = 1024 * min(_SOG_PALETTE, 1 << int(math.log2(gaussians / 1024)))
+    return min(_SOG_ITERATIONS, int(limit_s / (_SOG_S_PER_PAIR * gaussians * palette)))
 
 
 def find_others(folder: Path = READERS) -> OtherPrograms:

@@ -23,7 +23,14 @@ from splatpipe.pipeline.photos.intake.camera_groups import CameraGroup, group_ca
 from splatpipe.pipeline.photos.intake.camera_issues import find_camera_issues
 from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto
-from splatpipe.pipeline.photos.intake.preparation import Preparation, Selection, select_photos
+from splatpipe.pipeline.photos.intake.preparation import (
+    MASKS,
+    SKIES,
+    Preparation,
+    Selection,
+    find_mask_issues,
+    select_photos,
+)
 from splatpipe.pipeline.photos.intake.too_few import explain_too_few
 from splatpipe.pipeline.photos.video.frames import extract_frames
 from splatpipe.pipeline.sfm.pairing.layout import make_layout, make_views
@@ -83,8 +90,9 @@ def read_capture(
             everything = Preparation(config.ingest.model_copy(update={"bands": ALL}), threads, root, report)
             chosen = select_photos(root, everything)
             findings = [Finding("bands", "error", error.message, error.hint)]
+        masked = [find_mask_issues(kind, photo_root(source.folder), chosen, work) for kind in (MASKS, SKIES)]
     photos = chosen.photos
-    findings += [*filmed, *_left_out(chosen)]
+    findings += [*filmed, *_left_out(chosen), *(finding_from_issue(issue) for issues in masked for issue in issues)]
     names = [photo.name for photo in photos]
     few = explain_too_few(source.folder, Path(source.folder.name), names, chosen.pictures_left_out, chosen.scan.others)
     if few is not None:

@@ -12,6 +12,7 @@ from splatpipe.pipeline.photos.intake.check import CheckedPhoto
 
 MAX_MINORITY_SHARE = 0.25  # share of the photos above which a camera was used on purpose
 VOWELS = frozenset("aeioAEIO")  # letters before which "an" is said
+NO_CAMERA = camera_name("", "")
 
 
 def find_camera_issues(
@@ -103,6 +104,8 @@ def _difference(photo: CheckedPhoto, other: CheckedPhoto) -> tuple[str, str]:
     if mine != theirs and not (other_size and not any(mine)):
         if mine[:2] == theirs[:2]:
             return "cameras", f"another {camera_name(*mine[:2])} than the others, by its serial number"
+        if not any(mine):
+            return "cameras", f"no camera is named in EXIF, the others were taken with {_describe(other)}"
         return "cameras", f"taken with {_describe(photo)}, the others with {_describe(other)}"
     if other_size:
         return "resized", f"{photo.width} × {photo.height} px, the others {other.width} × {other.height}"
@@ -118,7 +121,7 @@ def _body(photo: CheckedPhoto) -> tuple[str, str, str]:
 def _describe(photo: CheckedPhoto) -> str:
     name = camera_name(photo.exif.make, photo.exif.model)
     focal = _focal(photo)
-    article = "an" if name[0] in VOWELS else "a"
+    article = "an" if name[0] in VOWELS or name == NO_CAMERA else "a"
     return f"{article} {name}" + (f" ({focal})" if focal != "unknown" else "")
 
 

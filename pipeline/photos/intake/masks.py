@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from splatpipe.pipeline.engine.digests import is_real_file
 from splatpipe.pipeline.engine.machine import pseudo_devices
@@ -147,7 +147,7 @@ def read_mask(mask: MaskFile, photo: CheckedPhoto, max_pixels: int) -> UInt8[np.
     except MaskError:
         raise
     except Exception as error:  # Pillow's readers raise almost anything on broken images
-        raise MaskError(f"cannot be read ({' '.join(str(error).split())[:120]})") from error
+        raise MaskError(_problem(mask.path, error)) from error
     drawn = grey if exif.orientation == photo.exif.orientation else _to_stored(grey, exif.orientation, photo)
     if not _same_shape(drawn.size, (photo.width, photo.height)):
         raise _other_shape(grey)
@@ -155,6 +155,14 @@ def read_mask(mask: MaskFile, photo: CheckedPhoto, max_pixels: int) -> UInt8[np.
     threshold = 1 if lossless and int(values.max()) < FEW_LABELS else HALF
     binary = Image.fromarray(np.where(values >= threshold, np.uint8(255), np.uint8(0)))
     return np.asarray(binary.resize((photo.width, photo.height), Image.Resampling.NEAREST))
+
+
+def _problem(path: Path, error: Exception) -> str:
+    """Why a mask cannot be read, without its path."""
+    if isinstance(error, UnidentifiedImageError):
+        return "is empty" if path.stat().st_size == 0 else "cannot be read: it is no picture, or its header is damaged"
+    text = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    return f"cannot be read ({' '.join(text.split())[:120].replace(str(path), path.name)})"
 
 
 def _require_size(picture: Image.Image, photo: CheckedPhoto) -> None:

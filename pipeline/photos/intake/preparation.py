@@ -12,14 +12,23 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatpipe.pipeline.engine.stage import Reporter
-from splatpipe.pipeline.photos.files.names import list_names, printable
+from splatpipe.pipeline.photos.files.names import list_names
 from splatpipe.pipeline.photos.files.photo_list import (
     CONVERTED_DIR,
     MASK_DIR,
     SKY_DIR,
 )
-from splatpipe.pipeline.photos.files.scan import MASK_FOLDER, SKY_FOLDER, ExcludedPhoto, PhotoMask, Scan, scan_folder
+from splatpipe.pipeline.photos.files.scan import (
+    MASK_FOLDER,
+    SKY_FOLDER,
+    ExcludedPhoto,
+    PhotoMask,
+    Scan,
+    scan_folder,
+    with_reason,
+)
 from splatpipe.pipeline.photos.intake.bands import choose_band
+from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.intake.check import CheckedPhoto, PictureLimits, check_photo
 from splatpipe.pipeline.photos.intake.convert import convert_photo, save_png, scale_of
 from splatpipe.pipeline.photos.intake.duplicates import split_duplicates, split_maps
@@ -139,43 +148,92 @@ def prepare_masks(
     kind: MaskKind, root: Path, chosen: Selection, opacity: Mapping[str, UInt8[np.ndarray, "h w"]], work: Preparation
 ) -> set[str]:
     """Write the masks of a kind: from its folder, beside the photos, from transparency; return the masked photos."""
-    photos = chosen.photos
-    files = find_masks(root, kind.folder) if work.config.masks else []
-    matched, unused = match_masks(files, [photo.name for photo in photos] + [entry.name for entry in chosen.left_out])
-    if kind is MASKS and work.config.masks:
-        matched = with_masks_beside(matched, chosen.masks)
-    if unused:
-        names = list_names([mask.label for mask in unused])
-        work.report.warning(f"There is no photo for the mask {names}.", "A mask must have its photo's name: NAME.png.")
-    masked = [photo for photo in photos if photo.name in matched or photo.name in opacity]
+    matched, unmatched = _match(kind, root, chosen, work)
+    masked = [photo for photo in chosen.photos if photo.name in matched or photo.name in opacity]
 
-    def write(photo: CheckedPhoto) -> str | None:
-        problem, values = _read(matched.get(photo.name), photo, work.max_pixels)
+    def write(photo: CheckedPhoto) -> _MaskFault | None:
+        fault, values = _read(matched.get(photo.name), photo, work.max_pixels)
         clear = opacity.get(photo.name)
         if clear is not None:
             values = clear if values is None else np.minimum(values, clear)
         if values is None:
-            return problem
+            return fault
         save_png(values, work.part / mask_path(photo.name, kind.part))
-        if kind is MASKS and np.mean(values == 0) > MAX_MASKED_SHARE:
-            return f"The mask of {printable(photo.name)} hides almost the whole photo: black areas are ignored."
-        return problem
+        return fault or _too_much(kind, photo, values)
 
-    problems = _in_threads(write, masked, work, "preparing masks", "masks")
-    for problem in dict.fromkeys(problem for problem in problems if problem is not None):
-        work.report.warning(problem)
+    faults = _in_threads(write, masked, work, "preparing masks", "masks")
+    for issue in [*unmatched, *_mask_issues(faults)]:
+        work.report.warning(issue.message, issue.hint)
     return {photo.name for photo in masked if (work.part / mask_path(photo.name, kind.part)).is_file()}
+
+
+def find_mask_issues(kind: MaskKind, root: Path, chosen: Selection, work: Preparation) -> list[CaptureIssue]:
+    """Read the masks of a kind as ``prepare_masks`` does, and write none; return what it would warn of."""
+    matched, unmatched = _match(kind, root, chosen, work)
+    masked = [photo for photo in chosen.photos if photo.name in matched]
+
+    def read(photo: CheckedPhoto) -> _MaskFault | None:
+        fault, values = _read(matched[photo.name], photo, work.max_pixels)
+        return fault if values is None else _too_much(kind, photo, values)
+
+    return [*unmatched, *_mask_issues(_in_threads(read, masked, work, "checking masks", "masks"))]
+
+
+@dataclass(frozen=True)
+class _MaskFault:
+    """A mask that cannot be used, and why; without a reason, one that hides almost the whole photo."""
+
+    photo: str
+    label: str = ""
+    reason: str = ""
+
+
+def _match(
+    kind: MaskKind, root: Path, chosen: Selection, work: Preparation
+) -> tuple[Mapping[str, MaskFile], list[CaptureIssue]]:
+    """The masks by photo name, and a warning of those without a photo."""
+    files = find_masks(root, kind.folder) if work.config.masks else []
+    names = [photo.name for photo in chosen.photos] + [entry.name for entry in chosen.left_out]
+    matched, unused = match_masks(files, names)
+    if kind is MASKS and work.config.masks:
+        matched = with_masks_beside(matched, chosen.masks)
+    if not unused:
+        return matched, []
+    text = f"There is no photo for the mask {list_names([mask.label for mask in unused])}."
+    return matched, [CaptureIssue("masks", text, "A mask must have its photo's name: NAME.png.")]
 
 
 def _read(
     mask: MaskFile | None, photo: CheckedPhoto, max_pixels: int
-) -> tuple[str | None, UInt8[np.ndarray, "h w"] | None]:
+) -> tuple[_MaskFault | None, UInt8[np.ndarray, "h w"] | None]:
     if mask is None:
         return None, None
     try:
         return None, read_mask(mask, photo, max_pixels)
     except MaskError as error:
-        return f"The mask {printable(mask.label)} {error}; it is not used.", None
+        return _MaskFault(photo.name, mask.label, str(error)), None
+
+
+def _too_much(kind: MaskKind, photo: CheckedPhoto, values: UInt8[np.ndarray, "h w"]) -> _MaskFault | None:
+    return _MaskFault(photo.name) if kind is MASKS and np.mean(values == 0) > MAX_MASKED_SHARE else None
+
+
+def _mask_issues(faults: Sequence[_MaskFault | None]) -> list[CaptureIssue]:
+    """One warning for each reason."""
+    of_reason: dict[str, list[_MaskFault]] = {}
+    for fault in faults:
+        if fault is not None:
+            of_reason.setdefault(fault.reason, []).append(fault)
+    issues = []
+    for reason, of_one in of_reason.items():
+        photos = tuple(fault.photo for fault in of_one)
+        if reason:
+            text = f"Masks not used: {with_reason([fault.label for fault in of_one], reason)}."
+        else:
+            hide = "mask of {} hides" if len(photos) == 1 else "masks of {} hide"
+            text = f"The {hide.format(list_names(photos))} almost the whole photo: black areas are ignored."
+        issues.append(CaptureIssue("masks", text, photos=photos))
+    return issues
 
 
 def converted_path(name: str) -> str:

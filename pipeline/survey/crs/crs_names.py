@@ -27,6 +27,7 @@ LIKE_WGS84 = ("WGS84", "GRS80")  # ellipsoids within a tenth of a millimetre of 
 
 _EPSG = re.compile(r"EPSG\s*:\s*(\d{1,6})(?:\s*\+\s*(?:EPSG\s*:\s*)?(\d{1,6}))?", re.IGNORECASE | re.ASCII)
 _UTM = re.compile(r"WGS\s?84\s*/?\s*UTM\s*(?:zone\s*)?(\d{1,2})\s*([NS])", re.IGNORECASE | re.ASCII)
+_WGS84 = re.compile(r"WGS[ _]?(?:19)?84", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def parse_crs(text: str) -> Crs:
     """Read a CRS as surveyors' files and options name it.
 
     Args:
-        text: ``EPSG:n``, ``EPSG:n+m`` (m: its heights), ``+proj=…`` or ``WGS84 UTM 33N``.
+        text: ``EPSG:n``, ``EPSG:n+m`` (m: its heights), ``+proj=…``, ``WGS84 UTM 33N`` or ``WGS 84`` (degrees).
 
     Raises:
         SplatpipeError: if it has none of these forms, is unknown to PROJ, or is neither projected nor geographic.
@@ -81,6 +82,8 @@ def parse_crs(text: str) -> Crs:
         if not 1 <= zone <= 60:
             raise SplatpipeError(f"There is no UTM zone {zone}.", "UTM has the zones 1 to 60.")
         return _from_epsg(str((32600 if side == "N" else 32700) + zone), None)
+    if _WGS84.fullmatch(text):
+        return _from_epsg("4326", None)
     if text.startswith("+"):
         return _from_proj(text)
     raise SplatpipeError(f'"{text}" is not a coordinate reference system in a known form.', FORMS)

@@ -252,6 +252,29 @@ def test_what_lies_in_place_of_photos_is_named(tmp_path: Path) -> None:
         assert str(tmp_path) not in few.message + few.hint  # the page may be sent on
 
 
+def test_masks_are_checked_as_in_a_run(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    (photos / "masks").mkdir(parents=True)
+    for number in range(1, 6):
+        shutil.copy(capture_path() / name(number), photos)
+    Image.new("L", (600, 450), 255).save(photos / "masks" / "DJI_0001.png")
+    Image.new("L", (450, 450), 255).save(photos / "masks" / "DJI_0002.png")
+    (photos / "masks/DJI_0003.JPG.png").touch()
+    (photos / "masks/DJI_0004.png").write_text("no picture")
+    Image.new("L", (1200, 900), 0).save(photos / "DJI_0005_mask.png")
+    Image.new("L", (1200, 900), 255).save(photos / "masks" / "DJI_9999.png")
+    issues = found(examined(photos), "masks")
+    assert {issue.photos: issue.message for issue in issues} == {
+        (): "There is no photo for the mask masks/DJI_9999.png.",
+        (name(2),): "Masks not used: masks/DJI_0002.png has another aspect ratio (450 × 450) than its photo.",
+        (name(3),): "Masks not used: masks/DJI_0003.JPG.png is empty.",
+        (name(4),): "Masks not used: masks/DJI_0004.png cannot be read: it is no picture, or its header is damaged.",
+        (name(5),): "The mask of DJI_0005.JPG hides almost the whole photo: black areas are ignored.",
+    }
+    assert {issue.severity for issue in issues} == {"warning"}
+    assert found(examined(photos, "ingest.masks=false"), "masks") == []
+
+
 def test_several_models_are_told(tmp_path: Path) -> None:
     (tmp_path / "cm/images").mkdir(parents=True)
     for model, count in (("0", 2), ("1", 5)):

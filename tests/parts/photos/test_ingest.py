@@ -618,11 +618,23 @@ def test_masks_that_do_not_fit_are_named(folder: Path) -> None:
     half_black(300, 300).save(folder / "masks" / "a.png")
     half_black(WIDTH, HEIGHT).save(folder / "masks" / "nobody.png")
     (folder / "masks" / "b.png").write_text("no mask")
+    save(folder / "c.jpg", 3)
+    (folder / "masks" / "c.png").touch()
     result = ingest(folder)
     assert result.summary["masks"] == 0
+    assert any("masks/c.png is empty" in warning for warning in result.warnings)
+    assert not any(str(folder.parent) in warning for warning in result.warnings)
     assert any("masks/a.png has another aspect ratio" in warning for warning in result.warnings)
     assert any("masks/nobody.png" in warning for warning in result.warnings)
     assert any("masks/b.png cannot be read" in warning for warning in result.warnings)
+
+
+def test_masks_with_one_fault_are_named_together(folder: Path) -> None:
+    (folder / "masks").mkdir()
+    for name in ("a.png", "b.png"):
+        half_black(300, 300).save(folder / "masks" / name)
+    (warning,) = [warning for warning in ingest(folder).warnings if "mask" in warning]
+    assert "masks/a.png, masks/b.png; each has another aspect ratio (300 × 300) than its photo" in warning
 
 
 def test_masks_that_leave_nothing_are_reported(folder: Path) -> None:

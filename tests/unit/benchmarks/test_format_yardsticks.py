@@ -10,6 +10,7 @@ import tiny_scene
 import torch
 from captures import CaptureRun, decibels, likely_frame
 from floater_planting import KINDS, SEEN_ALPHA, plant, render_depths
+from others import sog_iterations
 from position_errors import SITE_M, position_row, site_of
 
 from splatpipe.pipeline.raster.rasterizer import RenderOptions
@@ -87,3 +88,10 @@ def test_floaters_are_planted_in_front_of_surfaces_and_visible(scene):
     assert size[KINDS.index("oversized")] > size[KINDS.index("haze")]
     again = plant(model, views, options, 40, np.random.default_rng(3))
     assert torch.equal(again.model.means, planted.model.means)
+
+
+def test_another_programs_palette_takes_bounded_time_or_is_left_out():
+    assert sog_iterations(800, 1.0) == 10
+    assert sog_iterations(18_000, 600.0) == 10  # its default
+    assert sog_iterations(130_000, 600.0) == 1
+    assert sog_iterations(1_000_000, 600.0) == 0

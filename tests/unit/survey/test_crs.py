@@ -56,6 +56,8 @@ def far_points(count: int = 40) -> np.ndarray:
         ("EPSG:5555", "EPSG:5555", "EPSG:5783"),
         ("EPSG:4326", "EPSG:4326", "unknown"),
         ("EPSG:4979", "EPSG:4979", "ellipsoidal"),
+        ("WGS 84", "EPSG:4326", "unknown"),  # as Emlid names it
+        ("wgs84", "EPSG:4326", "unknown"),
         ("+init=epsg:32633", "EPSG:32633", "unknown"),
         ("+proj=utm +zone=33 +datum=WGS84 +units=m", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs", "unknown"),
     ],
