@@ -6,8 +6,8 @@ arrangement explains nearly all of them. So a model is refuted by what is found,
 
 Poses are adjusted to the epipolar lines of all pairs' matches, without points, by graduated non-convexity (Yang et al.,
 RA-L 2020) with Geman and McClure's loss: wide at first, with more weight for the contradicting pairs, and in the end as
-narrow as the judge's own bound. It starts from the model, and from models in which a group of cameras is moved by the
-similarity that its contradicting pairs ask for.
+narrow as the judge's own bound. It starts from the model, once more with a narrow loss alone, and from models in which
+a group of cameras is moved by the similarity that its contradicting pairs ask for.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ LOSS_WIDTHS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # widths of the robust loss, tim
 GAUSS_NEWTON_STEPS = 4  # Gauss-Newton steps at each width
 CONTRADICTION_WEIGHT, MIN_FAVOURED_WIDTH = 4.0, 8.0  # weight of contradicting pairs from that width of the loss on
 MOVED_LOSS_WIDTHS = (4.0, 2.0, 1.0)  # where a group was moved: its place is nearly right
+SLIGHT_LOSS_WIDTHS = (2.0, 1.0)  # for a slight bend among many wrong pairs, which a wider loss would follow
 DAMPING = 1e-4  # added share of the normal matrix' diagonal: the world's frame and chains of photos are undetermined
 IRLS_ROUNDS = 10  # rounds of the reweighted fit of a group's place
 WEAK_SCALE = 0.01  # weight of a group's scale staying as it is: a single line of sight leaves it open
@@ -271,7 +272,9 @@ def find_better(
     here, now = arrangement_of(model, numbers), agreement
     for number in range(MAX_MOVED_GROUPS + 1):
         against = contradicting(now)
-        starts: list[tuple[Arrangement, Sequence[float]]] = [(here, LOSS_WIDTHS)] if number == 0 else []
+        starts: list[tuple[Arrangement, Sequence[float]]] = []
+        if number == 0:
+            starts = [(here, LOSS_WIDTHS), (here, SLIGHT_LOSS_WIDTHS)]
         group = find_cut(now, against)
         if group.ratio >= MIN_CONTRADICTION_RATIO:
             moved = _moved_group(model, verified, (now, here), group.group, numbers)
