@@ -106,7 +106,7 @@ def sog_iterations(gaussians: int, limit_s: float) -> int:
     """How many iterations of its palette's k-means splat-transform's SOG writer makes in a time.
 
     Without a GPU it looks for each Gaussian's nearest palette entry in a k-d tree of 45 dimensions, hence at nearly all
-    entries: 10 iterations for 130,000 Gaussians take more than an hour.
+    entries: 10 iterations for 130,000 Gaussians would take more than an hour, by this figure.
 
     Args:
         gaussians: Number of Gaussians, of SH degree 3.

@@ -35,7 +35,7 @@ from splatpipe.pipeline.splat.model.scene import Scene
 ASKED_DB = {"ply": math.inf, "model": math.inf, "glb": 70.0, "spz": 38.0, "sog": 38.0, "compressed-ply": 38.0}
 MAX_LOSS_DB = 0.3  # splat-transform's
 MAX_GROWTH = 1.05  # times splat-transform's
-SOG_S = 600.0  # CPU seconds for the palette of splat-transform's SOG: on a CPU, its 10 iterations can take hours
+SOG_S = 600.0  # CPU seconds for the palette of splat-transform's SOG: on a CPU, its 10 iterations take long
 SITE, DESTROYED = "3 km", "would destroy the splat"
 LIKE = {"model": "ply"}  # formats that store positions as another one does
 

@@ -84,7 +84,7 @@ def compared(accuracy: BlockAccuracy, scene: Scene, whole: Block | None = None) 
     Args:
         accuracy: Of the block, or of a part of it.
         scene: The truth.
-        whole: The adjusted block, if it is of a part.
+        whole: The adjusted block, where the accuracy may be of a part.
     """
     rows = accuracy.points
     if whole is not None:

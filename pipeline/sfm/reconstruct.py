@@ -262,8 +262,8 @@ def _rejudge(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
 def _with_held_focal(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
     """Return the attempt, or one with the focal length held near its prior if it strayed from that without need.
 
-    That is where the photos do not determine it, or where it contradicts a reliable value; the held focal length has to
-    explain the matches just as well.
+    That is where the photos do not determine it, or where the judge doubts it; the held focal length has to explain the
+    matches just as well.
     """
     enough = answer.placed >= ENOUGH_SHARE * len(work.verified.names)  # a small model says nothing about the lens
     if not enough or not work.further or not _focal_in_doubt(answer, work.verified.cameras):
@@ -312,7 +312,7 @@ def _has_points(model: Model) -> bool:
 
 
 def _focal_in_doubt(answer: MappingAttempt, priors: Mapping[int, pycolmap.Camera]) -> bool:
-    """Whether a focal length left its prior, and the photos do not determine it, or the prior is reliable."""
+    """Whether a focal length left its prior, and the photos do not determine it or the judge doubts it."""
     model = answer.models[0]
     used = _used(model)
     strayed = [

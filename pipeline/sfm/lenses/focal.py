@@ -17,11 +17,11 @@ import pyceres
 import pycolmap
 
 from splatpipe.pipeline.sfm.lenses.lens_blocks import keep_shape
+from splatpipe.pipeline.sfm.mapping.completion import ROBUST_PX
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 
 UNOBSERVED = 0.01  # relative standard deviation above which the photos do not determine a focal length
 PRINCIPAL_POINT_SIGMA = 0.01  # prior standard deviation of the principal point over the image width
-ROBUST_PX = 1.0  # scale of the loss
 MAX_DENSE = 60  # photos up to which the reduced system is solved densely
 MAX_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6

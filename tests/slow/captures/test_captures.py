@@ -42,7 +42,7 @@ def test_a_phones_focal_length_that_the_photos_do_not_determine_stays_near_the_s
 ) -> None:
     """Incremental mapping places 2 of these 29 photos, and free, the focal length becomes 706 pixels.
 
-    An iPhone 4S has 4.28 mm over a sensor 4.54 mm wide: 965 pixels. Its EXIF states 35 mm, which is 1035.
+    An iPhone 4S has some 4.28 mm over a sensor 4.54 mm wide: 965 pixels. Its EXIF states 35 mm, which is 1035.
     """
     splatpipe("run", captures / "lund" / "photos", tmp_path / "out", "--preset", "preview", "--until", "sparse")
     [summary] = (tmp_path / "out" / "stages").glob("sparse-*/models.json")
