@@ -273,6 +273,24 @@ def lay_over(sky: tuple[Any, ...], colour: Tensor, out: Tensor) -> None:
 def lay_over_backward(sky: tuple[Any, ...], upstream: Tensor, by_alpha: Tensor, by_nodes: Tensor | None) -> None:
     """Gradients for the opacity and the nodes, from the gradient for the result."""
 
+def nearest_descriptors(
+    queries: tuple[np.ndarray, np.ndarray],
+    values: tuple[np.ndarray, np.ndarray],
+    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """The nearest and second nearest of descriptors by their products, group by group, on the calling thread.
+
+    Args:
+        queries: Descriptors, uint8 (n, 128), and the bounds of their groups, int64 (groups + 1,).
+        values: The same of those that each group's queries are compared with.
+        found: For each query the row of the nearest, counted from its group's start, int64 (n,), the first of equal
+            ones; its product, and the largest product of the others (0 without any), int32 (n,). Those of queries
+            in no group, or in one without values, are left as they are.
+
+    Raises:
+        ValueError: if sizes do not fit, or bounds are out of order or range.
+    """
+
 def patch_match(
     photo: tuple[np.ndarray, np.ndarray],
     others: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],

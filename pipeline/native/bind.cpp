@@ -17,6 +17,7 @@ void bind_features(nb::module_& m);
 void bind_loss(nb::module_& m);
 void bind_adam(nb::module_& m);
 void bind_patch_match(nb::module_& m);
+void bind_descriptors(nb::module_& m);
 void bind_sky(nb::module_& m);
 void bind_surface(nb::module_& m);
 
@@ -37,7 +38,7 @@ void set_isa(const std::string& name) {
 
 NB_MODULE(_native, m) {
     nb::set_leak_warnings(false);  // a graph that is still referenced at exit is not a leak
-    m.doc() = "Native kernels: rasterizer, loss, optimiser, depths, surfaces.";
+    m.doc() = "Native kernels: rasterizer, loss, optimiser, depths, descriptors, surfaces.";
     m.def("set_threads", &splat::set_threads, "threads"_a, "Threads of the one pool that all kernels share.");
     m.def("threads", &splat::thread_count);
     m.def("isa", [] { return std::string(splat::isa_name(splat::active_isa())); }, "The instruction set in use.");
@@ -49,6 +50,7 @@ NB_MODULE(_native, m) {
     bind_loss(m);
     bind_adam(m);
     bind_patch_match(m);
+    bind_descriptors(m);
     bind_sky(m);
     bind_surface(m);
 }
