@@ -24,6 +24,7 @@ ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels shown as the br
 EQUAL_DB = 100.0  # stands for the infinite PSNR of identical images: JSON has no infinity
 MASKED_GREY = 128
 MIN_INSIDE_SHARE = 0.01  # share of a photo inside the boundary below which it is not measured
+LEVELS = np.arange(256, dtype=np.float32) / np.float32(255.0)  # of 8 bits, as the metrics take them
 MAX_STEM_CHARACTERS = 100  # characters; file systems allow 255 bytes, and a letter may take four
 
 
@@ -81,13 +82,16 @@ def measure(render: Pixels, photo: Pixels, mask: Mask | None) -> dict[str, float
         photo: (h, w, 3).
         mask: (h, w), True where pixels count.
     """
-    x, y = (torch.from_numpy(pixels.astype(np.float32) / np.float32(255.0)) for pixels in (render, photo))
+    x, y = (torch.from_numpy(cv2.LUT(pixels, LEVELS)) for pixels in (render, photo))
     mask_tensor = None if mask is None else torch.from_numpy(mask)
     try:
         pair = metrics.pair_of(x, y, mask_tensor)
     except ValueError:  # no pixel counts
         return dict.fromkeys(metrics.METRICS)
-    return {name: _measured(metric, pair) for name, metric in metrics.METRICS.items()}
+    try:
+        return {name: _measured(metric, pair) for name, metric in metrics.METRICS.items()}
+    finally:
+        return_free_heap()  # metrics free hundreds of megabytes, which the heaps of several threads would keep
 
 
 def _measured(metric: metrics.Metric, pair: metrics.ImagePair) -> float | None:
@@ -95,8 +99,6 @@ def _measured(metric: metrics.Metric, pair: metrics.ImagePair) -> float | None:
         value = float(metric.of_pair(pair))
     except ValueError:  # too few pixels for this metric
         return None
-    finally:
-        return_free_heap()  # metrics free hundreds of megabytes, which the heaps of several threads would keep
     value = min(value, EQUAL_DB) if metric in (metrics.psnr, metrics.psnr_cc) else value
     return round(value, 6) if math.isfinite(value) else None
 
@@ -132,8 +134,9 @@ def mean_megapixels(per_view: Sequence[dict[str, Any]]) -> float | None:
 
 def error_picture(render: Pixels, photo: Pixels, mask: Mask | None) -> Pixels:
     """Mean absolute error over the channels as a heat map of fixed scale, masked pixels grey; (h, w, 3) RGB."""
-    error = np.abs(render.astype(np.int16) - photo.astype(np.int16)).mean(axis=2) / 255.0
-    scaled = np.clip(error / ERROR_FULL_SCALE * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+    sums = cv2.absdiff(render, photo).sum(axis=2, dtype=np.uint16)  # over the channels: 0 to 765
+    colours = np.clip(np.arange(766) / 3 / 255.0 / ERROR_FULL_SCALE * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+    scaled = colours[sums]
     picture = np.asarray(cv2.applyColorMap(scaled, cv2.COLORMAP_INFERNO)[:, :, ::-1], np.uint8).copy()
     if mask is not None:
         picture[~mask] = MASKED_GREY

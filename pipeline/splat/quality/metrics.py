@@ -263,7 +263,7 @@ def sharpness(pair: ImagePair) -> float:
     counting pixels where the photo's gradient is largest.
     """
     gx, gy = (_gradient(pad(luma[None], [1] * 4, mode="replicate")[0], (1.0, 2.0, 1.0)) for luma in pair.lumas)
-    gx, gy = (gradient[1:-1, 1:-1][pair.counts] for gradient in (gx, gy))  # (pixels,)
+    gx, gy = (gradient[1:-1, 1:-1].masked_select(pair.counts) for gradient in (gx, gy))  # (pixels,)
     edges = max(1, math.ceil(_EDGE_SHARE * gy.numel()))
     least = float(np.partition(gy.numpy(), gy.numel() - edges)[gy.numel() - edges])
     above, level = torch.nonzero(gy > least)[:, 0], torch.nonzero(gy == least)[:, 0]
