@@ -26,6 +26,7 @@ from splatpipe.pipeline.survey.crs.frames import Frame, load_frame
 
 MAX_DEPTH_STEP = 0.02  # relative, between neighbouring pixels of one surface: slopes have less, edges far more
 MIN_HELD_OUT_PHOTOS = 3  # that show a point: with two, one floater moves the median by half of its distance
+AROUND_PX = 8  # around surveyed points that is rendered: interpolation takes the four pixels nearest to each
 DIGITS = 5  # decimals of lengths in metres: a hundredth of a millimetre
 POINT_FACTS = ("name", "role", "why", "surveyed_crs", "surveyed_m", "sigma_m", "estimated_m", "residual_m")
 DepthMap = Float[np.ndarray, "h w"]
@@ -74,7 +75,7 @@ def measure_accuracy(
             points do not count for the splat; all absent if only a dataset is evaluated.
         cameras: Cameras of the dataset's photos, at the size that depth is rendered at.
         held_out: Names of the held-out photos.
-        depth_of: Renders a photo's median depth.
+        depth_of: Renders a camera's median depth: that of a photo, or of a part of one.
 
     Raises:
         StageError: if a part is broken.
@@ -93,11 +94,11 @@ def measure_accuracy(
     wanted = sorted({seen.photo for chosen in seen_by.values() for seen in chosen})
     places: dict[str, list[dict[str, Any]]] = {point.name: [] for point in points}
     for photo in wanted:
-        depth = depth_of(by_name[photo])
-        for point in points:
-            for seen in seen_by[point.name]:
-                if seen.photo == photo:
-                    places[point.name] += _unprojected(seen, by_name[photo], depth, frame)
+        here = [(name, seen) for name, chosen in seen_by.items() for seen in chosen if seen.photo == photo]
+        camera = _around(by_name[photo], [seen.ray for _, seen in here])
+        depth = depth_of(camera)
+        for name, seen in here:
+            places[name] += _unprojected(seen, camera, depth, frame)
     return {**result, "splat": _splat(points, places, set(held_out))}
 
 
@@ -174,6 +175,16 @@ def _chosen(point: ObservedPoint, held_out: Sequence[str]) -> list[Observation]:
     """The observations in held-out photos; all observations if these are too few for a median."""
     unseen = [seen for seen in point.observations if seen.photo in set(held_out)]
     return unseen if len(unseen) >= MIN_HELD_OUT_PHOTOS else list(point.observations)
+
+
+def _around(camera: Camera, rays: Sequence[Float64[np.ndarray, " 2"]]) -> Camera:
+    """The part of a photo that is needed for the depths at these rays."""
+    pixels, size = camera.pixels_of(np.array(rays)), (camera.width, camera.height)
+    low, high = pixels.min(axis=0) - AROUND_PX, pixels.max(axis=0) + AROUND_PX
+    low = np.clip(np.floor(low), 0, [side - 1 for side in size]).astype(int)
+    high = np.clip(np.ceil(high), low + 1, size).astype(int)
+    left, top, width, height = (*low.tolist(), *(high - low).tolist())
+    return camera.crop(left, top, width, height)
 
 
 def _unprojected(seen: Observation, camera: Camera, depth: DepthMap, frame: Frame) -> list[dict[str, Any]]:
