@@ -22,6 +22,7 @@ from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED
 from splatpipe.pipeline.survey.adjustment.block import Block
 from splatpipe.pipeline.survey.adjustment.block_adjustment import (
+    ROUNDS,
     AdjustedBlock,
     PositionObservations,
     adjust_block,
@@ -148,12 +149,14 @@ def can_adjust(reconstruction: pycolmap.Reconstruction) -> bool:
     return reconstruction.num_points3D() > 0 and all(image.is_ref_in_frame() for image in images)
 
 
-def adjust(start: ControlStart, targets: Sequence[Target], bars: TargetDistances = NO_BARS) -> ControlAdjustment:
-    """Adjust a block to control, scale bars and positions."""
+def adjust(
+    start: ControlStart, targets: Sequence[Target], bars: TargetDistances = NO_BARS, rounds: int = ROUNDS
+) -> ControlAdjustment:
+    """Adjust a block to control, scale bars and positions, in at most so many steps."""
     first = len(start.block.points)
     block = _with_targets(start.block, [*targets, *bars.ends], start.table.numbers)
     block = replace(block, distances=Distances(first + bars.pairs, bars.lengths, bars.sigmas))
-    done = adjust_block(block, start.observed)
+    done = adjust_block(block, start.observed, rounds=rounds)
     cameras = sorted(set(start.table.cameras))
     focal_sigmas = _focal_sigmas(done, start.observed, cameras)
     held = [n for n in cameras if n in start.focal_priors and focal_sigmas.get(n, 0.0) > UNOBSERVED]
@@ -162,7 +165,7 @@ def adjust(start: ControlStart, targets: Sequence[Target], bars: TargetDistances
         for number in held:
             place = cameras.index(number)
             lenses[place] = _near(lenses[place], start.focal_priors[number])
-        done = adjust_block(replace(done.block, lenses=tuple(lenses)), start.observed, done.offsets)
+        done = adjust_block(replace(done.block, lenses=tuple(lenses)), start.observed, done.offsets, rounds)
     places, bar_ends = np.split(done.block.points[first:], [len(targets)])
     normed = [
         math.sqrt(float((((p - t.place) / t.sigmas) ** 2).sum()) / np.isfinite(t.sigmas).sum())

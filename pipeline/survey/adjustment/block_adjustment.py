@@ -73,6 +73,7 @@ def adjust_block(
     block: Block,
     positions: PositionObservations,
     offsets: Float64[np.ndarray, "g 3"] | None = None,
+    rounds: int = ROUNDS,
 ) -> AdjustedBlock:
     """Adjust photos, lenses, tie points and the flights' offsets together.
 
@@ -80,12 +81,13 @@ def adjust_block(
         block: Near the solution.
         positions: Of its photos.
         offsets: The flights' initial ones; zero by default.
+        rounds: Steps at most.
     """
     if offsets is None:
         offsets = np.zeros_like(positions.offset_sigmas)
     cost, damping, converged = block.cost() + positions.cost(block, offsets), DAMPING, False
     reduced = reduce_block(block)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         normal, gradient = joint_system(reduced, positions, block, offsets)
         step = solve(_damped(normal, damping), -gradient)
         gain = -float(gradient @ step)

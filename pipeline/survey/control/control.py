@@ -24,7 +24,7 @@ from splatpipe.pipeline.survey.adjustment.adjustment import (
     moved_px,
 )
 from splatpipe.pipeline.survey.adjustment.block_accuracy import accuracy_of
-from splatpipe.pipeline.survey.adjustment.block_adjustment import PositionObservations
+from splatpipe.pipeline.survey.adjustment.block_adjustment import ROUNDS, PositionObservations
 from splatpipe.pipeline.survey.adjustment.block_lens import Lens
 from splatpipe.pipeline.survey.adjustment.georef_input import GeorefInput
 from splatpipe.pipeline.survey.adjustment.position_adjustment import (
@@ -72,6 +72,7 @@ MAX_FOCAL_DEVIATION = 0.1  # relative deviation of a focal length from its prior
 SUSPICIOUS_SIGMAS = 1.0  # noise over sigmas; sound control with realistic sigmas stays well below
 SINGLE_BLUNDER_GAIN = 3.0  # a single point is the blunder if leaving it out reduces the noise by this factor
 MANY_OFF_SIGMAS = 3.0  # sigmas: if half of the points are off by more, it is not a single blunder
+SUSPECT_ROUNDS = 20  # steps that show whether the others agree: without a blunder they do after a few
 MAX_SUSPECTS = 3  # points with the largest residuals that are tried as the blunder
 MAX_ROUNDS = 4  # adjustments, each without a blunder found in the one before, or with larger sigmas
 
@@ -212,11 +213,11 @@ def _adjust_until_consistent(case: _Case, report: Reporter) -> _TrustedAdjustmen
     return best
 
 
-def _try(survey: Survey, factor: float, case: _Case) -> _TrustedAdjustment:
+def _try(survey: Survey, factor: float, case: _Case, rounds: int = ROUNDS) -> _TrustedAdjustment:
     chosen = _chosen(survey)
     targets = [_target(survey.points[k], k, factor, case) for k in chosen]
     bars, ends = _bars(survey, chosen, case)
-    done = adjust(case.start, targets, bars)
+    done = adjust(case.start, targets, bars, rounds)
     coordinates = np.array([3 if survey.points[k].surveyed.z is not None else 2 for k in chosen], dtype=np.int64)
     return _TrustedAdjustment(survey, done, ends, factor, _noise(done.normed, coordinates))
 
@@ -232,8 +233,11 @@ def _without_one(trusted: _TrustedAdjustment, case: _Case) -> tuple[int, float, 
         index = chosen[worst]
         points = list(trusted.survey.points)
         points[index] = points[index].left_out("adjusted to the others, the photos have it elsewhere")
-        rest = _try(trusted.survey.with_points(points), trusted.factor, case)
-        if rest.noise <= trusted.noise / SINGLE_BLUNDER_GAIN:
+        others, limit = trusted.survey.with_points(points), trusted.noise / SINGLE_BLUNDER_GAIN
+        rest = _try(others, trusted.factor, case, SUSPECT_ROUNDS)
+        if rest.noise <= limit and not rest.done.adjusted.converged:
+            rest = _try(others, trusted.factor, case)
+        if rest.noise <= limit:
             model = model_of(rest.done.reconstruction, capture.photos)
             found = locate(trusted.survey.points[index], model, capture.photos, case.config.mark_sigma_px).found
             if found is not None:
