@@ -189,7 +189,7 @@ CLEAN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=11,
+    version=12,
     config=EvaluateConfig,
     reads=(
         "clean.model",

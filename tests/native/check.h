@@ -64,5 +64,6 @@ void test_loss();
 void test_colour();
 void test_sky();
 void test_patch_match();
+void test_descriptors();
 void test_surface();
 void test_adam();

@@ -54,6 +54,7 @@ int main() {
     test_colour();
     test_sky();
     test_patch_match();
+    test_descriptors();
     test_surface();
     test_adam();
     std::printf("%d passed, %d failed\n", passed, failed);

@@ -1,8 +1,12 @@
-"""Matching of descriptors: only true mutual neighbours, nearly all of them, ties, and photos with few descriptors."""
+"""Matching of descriptors: only true mutual neighbours, nearly all of them, ties, photos with few descriptors;
+and the search itself on every instruction set."""
+
+import itertools
 
 import numpy as np
 import pytest
 
+from splatpipe.pipeline.native import _native
 from splatpipe.pipeline.sfm.matching.nearest_descriptors import group_descriptors, match_descriptors
 
 DISTANCE, RATIO = 0.7 * 512, 0.8
@@ -97,8 +101,58 @@ def test_descriptors_of_nothing_match_nothing() -> None:
     assert matches(np.zeros((60, 128), np.uint8), descriptors(60, 1)) == []
 
 
-def test_blocks_do_not_change_matches(monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = two_photos(600)
-    whole = matches(first, second)
-    monkeypatch.setattr("splatpipe.pipeline.sfm.matching.nearest_descriptors.BLOCK", 7)
-    assert matches(first, second) == whole
+def slowly_nearest(queries: np.ndarray, values: np.ndarray) -> tuple[list[int], list[int], list[int]]:
+    products = queries.astype(np.int64) @ values.astype(np.int64).T
+    rows = products.argmax(axis=1)
+    best = products.max(axis=1)
+    products[np.arange(len(queries)), rows] = 0
+    return rows.tolist(), best.tolist(), products.max(axis=1).tolist()
+
+
+def search(queries: tuple[np.ndarray, ...], values: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    count = len(queries[0])
+    found = np.full(count, -1, np.int64), np.full(count, -1, np.int32), np.full(count, -1, np.int32)
+    _native.nearest_descriptors(queries, values, found)
+    return found
+
+
+@pytest.mark.usefixtures("isa")
+@pytest.mark.parametrize(
+    ("count", "others"), [(1, 1), (1, 16), (6, 17), (7, 64), (13, 65), (5, 255), (30, 257), (3, 700)]
+)
+def test_products_are_exact_for_every_number_of_descriptors(count: int, others: int) -> None:
+    rng = np.random.default_rng(others)
+    queries, values = (rng.integers(0, 256, (n, 128), np.uint8) for n in (count, others))
+    queries[0], values[-1] = 255, 255  # the largest product that there can be
+    values[: others // 2] = values[others // 2 : others // 2 * 2]  # each of them twice: the first counts
+    found = search((queries, np.array([0, count])), (values, np.array([0, others])))
+    assert [part.tolist() for part in found] == [*slowly_nearest(queries, values)]
+
+
+@pytest.mark.usefixtures("isa")
+def test_groups_are_compared_each_for_itself() -> None:
+    rng = np.random.default_rng(5)
+    queries, values = (rng.integers(0, 90, (n, 128), np.uint8) for n in (50, 300))
+    bounds, theirs = np.array([0, 20, 20, 33, 45]), np.array([10, 200, 210, 210, 299])
+    found = search((queries, bounds), (values, theirs))
+    for number, (low, high) in enumerate(itertools.pairwise(bounds.tolist())):
+        part = values[theirs[number] : theirs[number + 1]]
+        expected = slowly_nearest(queries[low:high], part) if len(part) else 3 * ([-1] * (high - low),)
+        assert [each[low:high].tolist() for each in found] == [*expected]
+    assert all(set(part[45:].tolist()) == {-1} for part in found)  # in no group
+
+
+@pytest.mark.parametrize(
+    ("bounds", "theirs", "message"),
+    [
+        ([], [], "no bounds"),
+        ([-1, 3], [0, 3], "no bounds"),
+        ([0, 3, 2], [0, 1, 3], "not in order"),
+        ([0, 4], [0, 3], "out of range"),
+        ([0, 3], [0, 2, 3], "differ in groups"),
+    ],
+)
+def test_bounds_that_do_not_fit_are_refused(bounds: list[int], theirs: list[int], message: str) -> None:
+    some = np.zeros((3, 128), np.uint8)
+    with pytest.raises(ValueError, match=message):
+        search((some, np.array(bounds, np.int64)), (some, np.array(theirs, np.int64)))
