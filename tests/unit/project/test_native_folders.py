@@ -7,7 +7,8 @@ import pytest
 from repository import ROOT
 
 NATIVE = ROOT / "pipeline" / "native"
-FOLDERS = ("base", "adam descriptors loss patch_match sky surface", "raster", "cuda", ".")  # lowest first; the last is bind.cpp's
+# Lowest first; the last is bind.cpp's.
+FOLDERS = ("base", "adam descriptors loss patch_match sky surface", "raster", "cuda", ".")
 LEVELS = {folder: level for level, folders in enumerate(FOLDERS) for folder in folders.split()}
 INCLUDE = re.compile(r'^\s*#\s*include "(.+)"', re.MULTILINE)
 SOURCES = (".h", ".cpp", ".cuh", ".cu")
