@@ -179,11 +179,11 @@ def _chosen(point: ObservedPoint, held_out: Sequence[str]) -> list[Observation]:
 
 def _around(camera: Camera, rays: Sequence[Float64[np.ndarray, " 2"]]) -> Camera:
     """The part of a photo that is needed for the depths at these rays."""
-    pixels, size = camera.pixels_of(np.array(rays)), (camera.width, camera.height)
-    low, high = pixels.min(axis=0) - AROUND_PX, pixels.max(axis=0) + AROUND_PX
-    low = np.clip(np.floor(low), 0, [side - 1 for side in size]).astype(int)
-    high = np.clip(np.ceil(high), low + 1, size).astype(int)
-    left, top, width, height = (*low.tolist(), *(high - low).tolist())
+    pixels, size = camera.pixels_of(np.array(rays)), np.array([camera.width, camera.height])
+    first = np.clip(np.floor(pixels.min(axis=0) - AROUND_PX), 0, size - 1).astype(np.int64)
+    last = np.clip(np.ceil(pixels.max(axis=0) + AROUND_PX), first + 1, size).astype(np.int64)
+    left, top = first.tolist()
+    width, height = (last - first).tolist()
     return camera.crop(left, top, width, height)
 
 

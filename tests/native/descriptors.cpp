@@ -25,7 +25,8 @@ void check_count(std::int64_t query_count, std::int64_t value_count) {
     std::vector<std::int32_t> best(size), second(size);
     const splat::NearestJob job{queries.data(), query_count, values.data(), value_count,
                                 rows.data(),    best.data(), second.data()};
-    const std::int64_t query_bounds[] = {0, query_count / 2, query_count}, value_bounds[] = {0, value_count, value_count};
+    const std::int64_t query_bounds[] = {0, query_count / 2, query_count},
+                       value_bounds[] = {0, value_count, value_count};
     splat::compare_groups(job, query_bounds, value_bounds, 2);
     for (std::int64_t q = 0; q < query_count / 2; ++q) {
         std::int64_t row = 0;
@@ -35,8 +36,10 @@ void check_count(std::int64_t query_count, std::int64_t value_count) {
             for (std::int64_t k = 0; k < splat::kDescriptor; ++k)
                 product += std::int32_t{queries[static_cast<std::size_t>(q * splat::kDescriptor + k)]} *
                            values[static_cast<std::size_t>(v * splat::kDescriptor + k)];
-            if (product > first) next = first > next ? first : next, first = product, row = v;
-            else if (product > next) next = product;
+            if (product > first)
+                next = first > next ? first : next, first = product, row = v;
+            else if (product > next)
+                next = product;
         }
         const auto at = static_cast<std::size_t>(q);
         check(rows[at] == row && best[at] == first && second[at] == next, "query " + std::to_string(q));

@@ -13,8 +13,7 @@ using namespace nb::literals;
 
 namespace {
 
-using Descriptors =
-    nb::ndarray<const std::uint8_t, nb::shape<-1, splat::kDescriptor>, nb::c_contig, nb::device::cpu>;
+using Descriptors = nb::ndarray<const std::uint8_t, nb::shape<-1, splat::kDescriptor>, nb::c_contig, nb::device::cpu>;
 using Bounds = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Rows = nb::ndarray<std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Products = nb::ndarray<std::int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;

@@ -1,9 +1,9 @@
+#include "descriptors/nearest.h"
+
 #include <algorithm>
 #include <cstdint>
 #include <memory>
 #include <new>
-
-#include "descriptors/nearest.h"
 
 namespace splat {
 namespace {

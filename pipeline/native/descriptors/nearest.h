@@ -12,8 +12,8 @@ constexpr int kDescriptor = 128;
 constexpr std::int64_t kNearestMost = 1 << 24;  // descriptors that are compared at once: rows are kept as floats
 
 // Where a kernel works.
-constexpr int kNearestState = 3 * 16;                 // floats a query
-constexpr std::int64_t kNearestPacked = 64 * 1024;    // bytes, aligned to 64
+constexpr int kNearestState = 3 * 16;                    // floats a query
+constexpr std::int64_t kNearestPacked = 64 * 1024;       // bytes, aligned to 64
 constexpr std::int64_t kNearestRows = 16 * kDescriptor;  // floats, likewise
 
 // Queries, and the values that each is compared with.
