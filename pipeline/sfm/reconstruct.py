@@ -18,7 +18,14 @@ from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, adjust_within, focal
 from splatpipe.pipeline.sfm.mapping.completion import complete
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options, map_global, map_incremental
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
-from splatpipe.pipeline.sfm.model.structure import Structure, cameras_of, make_model, poses_of
+from splatpipe.pipeline.sfm.model.structure import (
+    Structure,
+    cameras_of,
+    loosely_tied,
+    make_model,
+    poses_of,
+    without,
+)
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.recovery.probing import (
@@ -130,7 +137,11 @@ class Reconstructor:
 
     def _judged(self, answer: MappingAttempt) -> MappingAttempt:
         if answer.models:
-            answer = replace(answer, judgement=judge(answer.models[0], self.verified, self.capture.cameras))
+            model, *others = answer.models
+            while loose := loosely_tied(model):
+                model = without(model, self.verified, loose)
+            found = judge(model, self.verified, self.capture.cameras)
+            answer = replace(answer, models=[model, *others], judgement=found)
         self.tried.append(answer)
         return answer
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,3 +92,28 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
     """Return the cameras of the placed photos, by number."""
     used = {model.images[number].camera_id for number in model.reg_image_ids()}
     return {number: model.cameras[number] for number in sorted(used)}
+
+
+def without(model: pycolmap.Reconstruction, verified: ViewGraph, photos: Collection[int]) -> pycolmap.Reconstruction:
+    """Return the model without some photos and without the points that fewer than two other photos observe."""
+    structure = read_structure(model)
+    tracks = [[element for element in track if element[0] not in photos] for track in structure.tracks]
+    poses = {number: pose for number, pose in poses_of(model).items() if number not in photos}
+    used = {verified.camera_of[number] for number in poses}
+    cameras = [camera for number, camera in cameras_of(model).items() if number in used]
+    return make_model(cameras, poses, verified, Structure(structure.points, tracks))
+
+
+def loosely_tied(model: pycolmap.Reconstruction) -> set[int]:
+    """Return the photos whose points only one other photo observes: how far they are from it, nothing determines.
+
+    None of a model of two photos, whose scale is free.
+    """
+    if model.num_reg_images() <= 2:
+        return set()
+    partners: dict[int, set[int]] = {number: set() for number in model.reg_image_ids()}
+    for point in model.points3D.values():
+        photos = {element.image_id for element in point.track.elements}
+        for number in photos:
+            partners[number] |= photos
+    return {number for number, seen in partners.items() if len(seen) <= 2}  # it and the other one

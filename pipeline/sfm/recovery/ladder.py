@@ -26,6 +26,7 @@ from splatpipe.pipeline.sfm.model.structure import (
     make_model,
     poses_of,
     read_structure,
+    without,
 )
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
@@ -343,16 +344,6 @@ def _not_held(verified: ViewGraph, model: Model, photos: Collection[int]) -> set
         if few or alone or explained[number] < LARGE_SHARE * matches[number]:
             bad.add(number)
     return bad
-
-
-def without(model: Model, verified: ViewGraph, photos: Collection[int]) -> Model:
-    """Return the model without some photos and without the points that fewer than two other photos observe."""
-    structure = read_structure(model)
-    tracks = [[element for element in track if element[0] not in photos] for track in structure.tracks]
-    poses = {number: pose for number, pose in poses_of(model).items() if number not in photos}
-    used = {verified.camera_of[number] for number in poses}
-    cameras = [camera for number, camera in cameras_of(model).items() if number in used]
-    return make_model(cameras, poses, verified, Structure(structure.points, tracks))
 
 
 def _row(name: str, before: MappingResult, after: MappingResult) -> dict[str, JSON]:

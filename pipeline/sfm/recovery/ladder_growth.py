@@ -88,8 +88,10 @@ def _only(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Bun
 
 
 def observations(model: pycolmap.Reconstruction, photos: Collection[int]) -> dict[int, int]:
-    """Count the keypoints of each photo that observe a point."""
-    return {number: int(model.images[number].num_points3D) for number in sorted(photos)}
+    """Count the keypoints of each photo that observe a point; none if an adjustment has dropped the photo."""
+    return {
+        number: int(model.images[number].num_points3D) if number in model.images else 0 for number in sorted(photos)
+    }
 
 
 def mean_error_px(model: pycolmap.Reconstruction) -> float:

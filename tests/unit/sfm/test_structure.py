@@ -1,0 +1,55 @@
+"""Points and tracks of a model: photos that only one other photo ties to the rest, and models without some photos."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+import pycolmap
+import pytest
+from view_graph import Ring, make_ring, model_of
+
+from splatpipe.pipeline.sfm.model.structure import (
+    Structure,
+    cameras_of,
+    loosely_tied,
+    make_model,
+    poses_of,
+    without,
+)
+from splatpipe.pipeline.sfm.recovery.ladder_growth import observations
+
+
+@pytest.fixture(scope="module")
+def ring() -> Ring:
+    return make_ring()
+
+
+def with_tracks(ring: Ring, tracks: Sequence[Sequence[int]]) -> pycolmap.Reconstruction:
+    """Return a model of the photos that are in tracks, each track a point of its own keypoints."""
+    used: Counter[int] = Counter()
+    elements = []
+    for photos in tracks:
+        elements.append([(photo, used[photo]) for photo in sorted(photos)])
+        used.update(photos)
+    model = model_of(ring, photos=sorted(used))
+    structure = Structure(np.zeros((len(tracks), 3)), elements)
+    return make_model(cameras_of(model).values(), poses_of(model), ring.verified, structure)
+
+
+def test_a_photo_whose_points_one_other_observes_is_loose(ring: Ring) -> None:
+    sound = [(1, 2, 3), (2, 3, 4), (1, 4)]
+    assert loosely_tied(with_tracks(ring, sound)) == set()
+    assert loosely_tied(with_tracks(ring, [*sound, (4, 5), (4, 5)])) == {5}
+    assert loosely_tied(with_tracks(ring, [*sound, (4, 5), (3, 5)])) == set()
+    assert loosely_tied(with_tracks(ring, [*sound, (3, 4, 5)])) == set()
+
+
+def test_two_photos_alone_are_not_loose(ring: Ring) -> None:
+    assert loosely_tied(with_tracks(ring, [(1, 2), (1, 2)])) == set()
+
+
+def test_a_photo_that_was_dropped_is_in_no_track_and_observes_nothing(ring: Ring) -> None:
+    smaller = without(with_tracks(ring, [(1, 2, 3), (2, 3, 4), (4, 5)]), ring.verified, {5})
+    assert sorted(smaller.reg_image_ids()) == [1, 2, 3, 4]
+    assert smaller.num_points3D() == 2  # what 4 alone observes is no point
+    assert observations(smaller, [1, 2, 3, 4, 5]) == {1: 1, 2: 2, 3: 2, 4: 1, 5: 0}
