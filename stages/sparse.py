@@ -18,6 +18,7 @@ from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import list_names
 from splatpipe.pipeline.photos.files.photo_list import load_photo_list
+from splatpipe.pipeline.photos.video.film_times import load_film_times
 from splatpipe.pipeline.sfm.by_camera import camera_rows, report_cameras, reset_underdetermined_focals
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.judging.doubles import doubles_reasons, find_doubles
@@ -31,6 +32,7 @@ from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.recovery.ladder import run_ladder
 from splatpipe.pipeline.sfm.recovery.ladder_pairs import tried_pairs
+from splatpipe.pipeline.sfm.shutter.rolling_shutter import correct_rolling_shutter, report_shutter, shutter_summary
 
 Model: TypeAlias = pycolmap.Reconstruction
 
@@ -45,6 +47,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         capture = _capture(inputs, Path(scratch))
         found = run_ladder(capture, reconstruct(capture, config, report), config, report)
         reset_underdetermined_focals(found.model, found.verified, capture.cameras)
+        found, shutter = _with_shutter(found, inputs["ingest.photos"], config, report)
         stated = stated_lenses(read_json(inputs["ingest.lenses"])["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
@@ -57,6 +60,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     reasons = [*outside, *doubles_reasons(found.verified, doubles)]
     summary = {
         **_summary(model, found, capture.cameras),
+        **shutter,
         "lenses": list(lenses),
         "alike": [[found.verified.names[number] for number in pair] for pair in verdict.alike],
         "doubles": doubles.as_json(found.verified),
@@ -69,6 +73,21 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     report_lenses(summary, report)
     counts = {key: len(summary[key]) for key in ("unregistered", "other_models", "alike")}
     return {**summary, **counts}
+
+
+def _with_shutter(
+    found: MappingResult, photos: Path, config: SparseConfig, report: Reporter
+) -> tuple[MappingResult, dict[str, JSON]]:
+    """Return the result of mapping with a film's rolling shutter corrected, and what was estimated of it."""
+    film = load_film_times(photos)
+    if film is None:
+        return found, {}
+    held = any(row.get("focal_held") for row in found.tried if row["chosen"])
+    priors = {number: camera.mean_focal_length() for number, camera in found.verified.cameras.items()} if held else {}
+    corrected = correct_rolling_shutter(found.model, found.verified, film, priors, config.seed)
+    report_shutter(corrected, report)
+    found = replace(found, model=corrected.model, verified=corrected.verified)
+    return found, {"rolling_shutter": shutter_summary(corrected)}
 
 
 def _capture(inputs: Inputs, scratch: Path) -> MappingInput:
