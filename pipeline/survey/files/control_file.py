@@ -55,20 +55,29 @@ SIGMA_BOUNDS_M = (1e-4, 1e3)
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "name": (
         *("name", "label", "point", "point_name", "gcp", "gcp_name", "gcp_label", "marker", "marker_name", "station"),
-        *("point_id", "pointid", "point_number", "point_no", "pt", "id"),
-        *("punkt", "punktnummer", "punktname", "nom", "nombre", "punto"),
+        *(
+            "point_id",
+            "pointid",
+            "point_number",
+            "point_no",
+            "pt",
+            "id",
+            "p",
+            "pnt",
+        ),  # P,N,E,Z,D: as Trimble names them
+        *("punkt", "punktnummer", "punktname", "punkt_id", "punkt_nr", "punktnr", "nom", "nombre", "punto"),
     ),
-    "x": ("x", "geo_x", "east", "easting", "e", "x/east", "x/easting", *EAST, *GEOGRAPHIC),
-    "y": ("y", "geo_y", "north", "northing", "n", "y/north", "y/northing", *NORTH, *GEOGRAPHIC_Y),
+    "x": ("x", "geo_x", "east", "easting", "e", "x/east", "x/easting", "grid_easting", *EAST, *GEOGRAPHIC),
+    "y": ("y", "geo_y", "north", "northing", "n", "y/north", "y/northing", "grid_northing", *NORTH, *GEOGRAPHIC_Y),
     "z": (
         *("z", "geo_z", "height", "h", "up", "alt", "altitude", "elevation", "elev", "z/altitude", "z/height"),
         *HEIGHT,
         *ELLIPSOIDAL_Z,
     ),
     "photo": (
-        *PHOTO,
-        "photo",
         "image",
+        "photo",
+        *PHOTO,
         "image_name",
         "imagename",
         "photo_name",
