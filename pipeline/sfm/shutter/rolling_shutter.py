@@ -19,6 +19,7 @@ from splatpipe.pipeline.sfm.mapping.retriangulation import retriangulate
 from splatpipe.pipeline.sfm.model.structure import cameras_of, make_model, poses_of, read_structure
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.shutter.film_motion import FrameMotion, frame_motions
+from splatpipe.pipeline.sfm.shutter.frame_shutter import FilmShutter
 from splatpipe.pipeline.sfm.shutter.readout import Readout, estimate_readout
 from splatpipe.pipeline.sfm.shutter.row_shift import shifts_of_frames
 
@@ -94,6 +95,12 @@ def _motions(model: pycolmap.Reconstruction, film: FilmTimes) -> dict[int, Frame
         {number: film.times_s[name] for number, name in known.items()},
         {number: film.part_of(name) for number, name in known.items()},
     )
+
+
+def film_shutter(model: pycolmap.Reconstruction, film: FilmTimes, readout_s: float) -> FilmShutter:
+    """Return the shutter of a finished model, in its frame."""
+    motions = _motions(model, film)
+    return FilmShutter(readout_s, {model.images[number].name: motion for number, motion in motions.items()})
 
 
 def _edge_shift_px(

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
 from film_scene import FRAME_S, HEIGHT, WIDTH, FilmScene, along, around, centre_errors_m, film_scene
 
+from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.shutter.film_motion import MAX_GAP_S, FrameMotion, frame_motions
+from splatpipe.pipeline.sfm.shutter.frame_shutter import load_film_shutter, save_film_shutter
 from splatpipe.pipeline.sfm.shutter.readout import regress
-from splatpipe.pipeline.sfm.shutter.rolling_shutter import correct_rolling_shutter
+from splatpipe.pipeline.sfm.shutter.rolling_shutter import correct_rolling_shutter, film_shutter
 from splatpipe.pipeline.sfm.shutter.row_shift import row_shifts
+from splatpipe.pipeline.survey.placing.model import model_of
 
 READOUT_S = 1.0 / 60.0
 TIMES_S = [1.25 * k for k in range(24)]
 POINTS = 1500
+MAX_NOISE_PX = 2.5  # the keypoints' noise is 0.4
 MAX_OFF = 0.2  # of the readout: four times its standard deviation in these scenes
 
 
@@ -83,6 +89,28 @@ def test_a_gap_or_a_cut_is_no_motion() -> None:
     straight = (pose_centre(poses[4]) - pose_centre(poses[3])) / 1.0
     np.testing.assert_allclose(found[3].velocity, straight)
     np.testing.assert_allclose(found[4].velocity, straight)
+
+
+def test_marks_are_corrected_as_the_keypoints_around_them_and_back(tmp_path: Path) -> None:
+    scene = film_scene(around, TIMES_S, READOUT_S, 0, points=POINTS)
+    found = correct_rolling_shutter(scene.model, scene.verified, scene.film).model
+    save_film_shutter(film_shutter(found, scene.film, READOUT_S), tmp_path)
+    assert load_film_shutter(tmp_path / "elsewhere") is None
+    film = load_film_shutter(tmp_path)
+    assert film is not None and film.readout_s == READOUT_S and len(film.motions) == len(TIMES_S)
+    model = model_of(found, [], film)
+    view = model.view(11, WIDTH)
+    image = found.images[model.image_ids[11]]
+    seen = [point for point in image.points2D if point.has_point3D()][::20]
+    for point in seen:
+        place = found.points3D[point.point3D_id].xyz
+        taken = view.pixel(place)
+        plain, _ = project_through_lens(view.camera, view.cam_from_model, place[None])
+        raw = scene.verified.keypoints[image.image_id]
+        assert np.linalg.norm(raw - taken, axis=1).min() < MAX_NOISE_PX  # as the frame shows it
+        np.testing.assert_allclose(view.still(taken), plain[0], atol=1.0)  # the depths around it differ a little
+    lying = model_of(found, []).view(11, WIDTH)
+    assert lying.shutter is None and (lying.still(np.ones(2)) == 1.0).all()
 
 
 def pose_centre(pose: np.ndarray) -> np.ndarray:
