@@ -28,6 +28,7 @@ from splatpipe.pipeline.sfm.shutter.row_shift import observed_rows, row_shifts
 
 MotionsOf: TypeAlias = Callable[[pycolmap.Reconstruction], Mapping[int, FrameMotion]]
 
+START_S = 0.02  # most cameras take 5 to 30 ms; searched from here in both directions, as flat ground has two minima
 ROUNDS = 4  # the geometry that corrections are computed with improves with them; two rounds are usual
 SETTLED = 0.1  # a step below this share of the standard deviation ends the rounds
 MAX_SETTLING, SETTLED_COST = 6, 2e-4  # adjustments at first, and the relative change of the cost that ends them
@@ -88,7 +89,8 @@ def estimate_readout(
     if trial.frames < MIN_FRAMES or frame_s <= 0.0:
         return Readout(frames=trial.frames)
     settled = trial.settled(model)
-    ends = [_search(trial, pycolmap.Reconstruction(settled), start * frame_s, frame_s) for start in (0.5, -0.5)]
+    start_s = min(0.5 * frame_s, START_S)
+    ends = [_search(trial, pycolmap.Reconstruction(settled), start, frame_s) for start in (start_s, -start_s)]
     best, other = sorted(ends, key=lambda end: end.cost)
     agree = abs(best.readout_s - other.readout_s) <= MIN_SIGMAS * max(best.sigma_s, other.sigma_s)
     sure = agree or other.cost > (1.0 + MIN_GAIN) * best.cost
@@ -113,8 +115,8 @@ def _search(trial: ReadoutTrial, model: pycolmap.Reconstruction, start_s: float,
     """Search the best readout time near one, by steps of the regression (Gauss-Newton with all else eliminated)."""
     readout_s, sigma_s = start_s, math.inf
     residuals = trial.residuals(trial.adjusted(readout_s, model))
-    further = trial.adjusted(readout_s - math.copysign(frame_s, start_s), pycolmap.Reconstruction(model))
-    effect = (trial.residuals(further) - residuals) / -math.copysign(frame_s, start_s)
+    further = trial.adjusted(-start_s, pycolmap.Reconstruction(model))
+    effect = (trial.residuals(further) - residuals) / (-2.0 * start_s)
     for _ in range(ROUNDS):
         step_s, sigma_s = regress(residuals, effect, trial.frame_of, trial.unknowns)
         if not math.isfinite(sigma_s) or abs(step_s) < SETTLED * sigma_s:
@@ -186,15 +188,18 @@ class ReadoutTrial:
 
 
 def _observations(model: pycolmap.Reconstruction) -> _Observations:
-    rows, points, pixels = {}, {}, {}
+    rows: dict[int, Int64[np.ndarray, " _"]] = {}
+    points: dict[int, tuple[int, ...]] = {}
+    pixels: dict[int, Float64[np.ndarray, "_ 2"]] = {}
     for number in sorted(model.reg_image_ids()):
         image = model.images[number]
-        rows[number] = observed_rows(image)
-        seen = [image.points2D[row] for row in rows[number].tolist()]
-        points[number] = tuple(int(point.point3D_id) for point in seen)
-        pixels[number] = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
-    kept = [number for number in rows if len(rows[number])]
-    return _Observations(*({number: each[number] for number in kept} for each in (rows, points, pixels)))
+        observed = observed_rows(image)
+        if len(observed):
+            seen = [image.points2D[row] for row in observed.tolist()]
+            rows[number] = observed
+            points[number] = tuple(int(point.point3D_id) for point in seen)
+            pixels[number] = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
+    return _Observations(rows, points, pixels)
 
 
 def _lens_of(camera: pycolmap.Camera) -> tuple[str, ...]:
