@@ -80,17 +80,17 @@ def estimate_readout(
     """Estimate the readout time.
 
     Args:
-        model: Some tracks of a film's model, keypoints as they are in the frames, cameras of wide models; changed in
-            place: poses, points and lenses of the best readout time.
+        model: Some tracks of a film's model, keypoints as they are in the frames, cameras of wide models; adjusted in
+            place, without corrections.
         motions_of: Returns the motion at each frame of a model.
         frame_s: Time between the film's frames, seconds.
     """
     trial = ReadoutTrial(model, motions_of)
     if trial.frames < MIN_FRAMES or frame_s <= 0.0:
         return Readout(frames=trial.frames)
-    settled = trial.settled(model)
+    trial.settle(model)
     start_s = min(0.5 * frame_s, START_S)
-    ends = [_search(trial, pycolmap.Reconstruction(settled), start, frame_s) for start in (start_s, -start_s)]
+    ends = [_search(trial, pycolmap.Reconstruction(model), start, frame_s) for start in (start_s, -start_s)]
     best, other = sorted(ends, key=lambda end: end.cost)
     agree = abs(best.readout_s - other.readout_s) <= MIN_SIGMAS * max(best.sigma_s, other.sigma_s)
     sure = agree or other.cost > (1.0 + MIN_GAIN) * best.cost
@@ -146,7 +146,7 @@ class ReadoutTrial:
         adjust_lenses(model, self._freedoms)
         return model
 
-    def settled(self, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    def settle(self, model: pycolmap.Reconstruction) -> None:
         """Adjust a model without corrections to convergence: flat ground lets a lens go a long way, in small steps."""
         before = math.inf
         for _ in range(MAX_SETTLING):
@@ -154,7 +154,6 @@ class ReadoutTrial:
             if cost >= (1.0 - SETTLED_COST) * before:
                 break
             before = cost
-        return model
 
     def _correct(self, model: pycolmap.Reconstruction, readout_s: float) -> None:
         motions: Mapping[int, FrameMotion] = self._motions_of(model)
