@@ -34,7 +34,7 @@ SETTLED = 0.1  # a step below this share of the standard deviation ends the roun
 MAX_SETTLING, SETTLED_COST = 6, 2e-4  # adjustments at first, and the relative change of the cost that ends them
 MIN_FRAMES = 8  # with a known motion: fewer give no standard deviation worth the name
 MIN_SIGMAS = 5.0  # the scatter between frames knows nothing of errors that all frames share
-MIN_GAIN = 0.005  # of the adjustment's cost: a shutter that explains less moves no camera by more than noise
+MIN_GAIN = 0.001  # of the adjustment's cost: a film with a global shutter gains a tenth of it by noise
 MAX_READOUT = 1.1  # times the time between frames, within which a camera must have read all rows
 
 
