@@ -292,6 +292,9 @@ def _report_adjustment(adjustment: JSON, report: Reporter) -> None:
 
 def _summary(frame: Frame, controlled: ControlResult | None, accuracy: JSON) -> Summary:
     residuals = {key: value for key, value in frame.residuals.items() if key.startswith("rmse")}
+    positions = accuracy["tables"]["gps"]
+    if positions is not None and positions["rmse_up_m"] is None:
+        residuals.pop("rmse_vertical_m", None)
     summary: dict[str, JSON] = {
         "kind": frame.kind,
         "note": frame.note,

@@ -88,7 +88,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=13,
+    version=14,
     config=GeorefConfig,
     reads=(
         "sparse.model",
