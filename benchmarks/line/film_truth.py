@@ -206,7 +206,9 @@ def main() -> None:
     options = parser.parse_args()
     width, height = map(int, options.size.split("x"))
     readout_s = 1.0 / 60.0 if options.rolling else 0.0
-    flight = Flight(options.seconds, options.turns, options.fps, width, height, options.exposure, readout_s, options.moments)
+    flight = Flight(
+        options.seconds, options.turns, options.fps, width, height, options.exposure, readout_s, options.moments
+    )
     gaussians = read_splat(options.splat)
     rendering = RenderOptions(
         sh_degree=gaussians.sh_degree, background=(0.62, 0.72, 0.82), antialias=True, near=0.05, depth=False
