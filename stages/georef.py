@@ -17,6 +17,7 @@ from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.photo_list import Photo, load_photo_list
 from splatpipe.pipeline.sfm.lenses.lens_model import named_params, stated_lenses
 from splatpipe.pipeline.sfm.model.sparse_model import write_model
+from splatpipe.pipeline.sfm.shutter.frame_shutter import save_film_shutter
 from splatpipe.pipeline.survey.adjustment.adjusted_positions import (
     adjust_model,
     adjusted_frame,
@@ -149,6 +150,8 @@ def _run(config: GeorefConfig, inputs: Inputs, out: Path, report: Reporter) -> S
     adjusted = controlled.adjusted if controlled is not None and controlled.adjusted is not None else adjusted
     if adjusted is not None:
         write_model(adjusted, out / "sparse" / "0")
+        if model.shutter is not None:
+            save_film_shutter(model.shutter, out / "sparse" / "0")
     else:
         copy_model(source, out / "sparse" / "0", may_link=inputs.photos_dir not in source.parents)
     report.progress(3, 3, "fitting the control", "steps")
@@ -186,7 +189,8 @@ def _by_positions(
     if found is None or not found.adopted:
         report_fit(frame, fit, model, positions, report)
         return frame, replace(capture, adjusted=found)
-    frame, model = adjusted_frame(frame, found), model_of(found.done.reconstruction, photos)
+    frame = adjusted_frame(frame, found)
+    model = model_of(found.done.reconstruction, photos, model.shutter)
     report.note(frame.note)
     report_frame(frame, model, positions, report)
     return frame, replace(capture, model=model, adjusted=found)
@@ -288,6 +292,9 @@ def _report_adjustment(adjustment: JSON, report: Reporter) -> None:
 
 def _summary(frame: Frame, controlled: ControlResult | None, accuracy: JSON) -> Summary:
     residuals = {key: value for key, value in frame.residuals.items() if key.startswith("rmse")}
+    positions = accuracy["tables"]["gps"]
+    if positions is not None and positions["rmse_up_m"] is None:
+        residuals.pop("rmse_vertical_m", None)
     summary: dict[str, JSON] = {
         "kind": frame.kind,
         "note": frame.note,

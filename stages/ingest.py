@@ -50,6 +50,7 @@ from splatpipe.pipeline.photos.intake.preparation import (
 )
 from splatpipe.pipeline.photos.intake.too_few import explain_too_few
 from splatpipe.pipeline.photos.options import IngestConfig
+from splatpipe.pipeline.photos.video.film_times import save_film_times
 from splatpipe.pipeline.photos.video.frames import FRAMES_DIR, extract_frames
 from splatpipe.pipeline.sfm.lenses.known_lenses import lenses_json, state_lenses
 from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens
@@ -76,7 +77,9 @@ def run(config: IngestConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     root = part / FRAMES_DIR if filmed else given
     _remove_leftovers(out, part, {root, out / MEASURES} if filmed else set())
     if filmed:
-        _report_film(extract_frames(given, root, config, inputs.machine.threads, report, out / MEASURES), report)
+        issues, times = extract_frames(given, root, config, inputs.machine.threads, report, out / MEASURES)
+        save_film_times(times, part)
+        _report_film(issues, report)
     if config.bands == AUTO and has_model(inputs.photos_dir):
         config = config.model_copy(update={"bands": ALL})  # a given model says which photos it is of
     work = Preparation(config, inputs.machine.threads, part, report)

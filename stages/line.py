@@ -17,7 +17,7 @@ from splatpipe.pipeline.web.options import ExportConfig, PublishConfig
 
 INGEST = Stage(
     "ingest",
-    version=7,
+    version=8,
     config=IngestConfig,
     reads=("source.photos", "source.geo", "source.lens"),
     parts={
@@ -53,7 +53,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=10,
+    version=11,
     config=SparseConfig,
     reads=(
         "matches.database",
@@ -88,7 +88,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=13,
+    version=14,
     config=GeorefConfig,
     reads=(
         "sparse.model",

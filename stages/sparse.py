@@ -18,6 +18,7 @@ from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import list_names
 from splatpipe.pipeline.photos.files.photo_list import load_photo_list
+from splatpipe.pipeline.photos.video.film_times import FilmTimes, load_film_times
 from splatpipe.pipeline.sfm.by_camera import camera_rows, report_cameras, reset_underdetermined_focals
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.judging.doubles import doubles_reasons, find_doubles
@@ -31,6 +32,14 @@ from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
 from splatpipe.pipeline.sfm.recovery.ladder import run_ladder
 from splatpipe.pipeline.sfm.recovery.ladder_pairs import tried_pairs
+from splatpipe.pipeline.sfm.shutter.frame_shutter import save_film_shutter
+from splatpipe.pipeline.sfm.shutter.rolling_shutter import (
+    Corrected,
+    correct_rolling_shutter,
+    film_shutter,
+    report_shutter,
+    shutter_summary,
+)
 
 Model: TypeAlias = pycolmap.Reconstruction
 
@@ -45,18 +54,25 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         capture = _capture(inputs, Path(scratch))
         found = run_ladder(capture, reconstruct(capture, config, report), config, report)
         reset_underdetermined_focals(found.model, found.verified, capture.cameras)
+        film = load_film_times(inputs["ingest.photos"])
+        shutter = None if film is None else _correct_shutter(found, film, config, report)
+        if shutter is not None:
+            found = replace(found, model=shutter.model, verified=shutter.verified)
         stated = stated_lenses(read_json(inputs["ingest.lenses"])["lenses"])
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
         tried = capture.tried | tried_pairs(found.database)
     model = canonical(found.model, found.colours, _keypoint_counts(found.verified))
     write_model(model, out / "sparse" / "0")
+    if film is not None and shutter is not None and shutter.readout.determined:
+        save_film_shutter(film_shutter(model, film, shutter.readout.estimate_s), out / "sparse" / "0")
     outside = outside_reasons(model, found.verified, capture.cameras, capture.positions)
     doubles = find_doubles(model, tried.union(found.verified.matches))
     verdict = judge(model, found.verified, capture.cameras)
     reasons = [*outside, *doubles_reasons(found.verified, doubles)]
     summary = {
         **_summary(model, found, capture.cameras),
+        **({} if shutter is None else {"rolling_shutter": shutter_summary(shutter)}),
         "lenses": list(lenses),
         "alike": [[found.verified.names[number] for number in pair] for pair in verdict.alike],
         "doubles": doubles.as_json(found.verified),
@@ -69,6 +85,15 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     report_lenses(summary, report)
     counts = {key: len(summary[key]) for key in ("unregistered", "other_models", "alike")}
     return {**summary, **counts}
+
+
+def _correct_shutter(found: MappingResult, film: FilmTimes, config: SparseConfig, report: Reporter) -> Corrected:
+    """Correct a film's rolling shutter, if it has one, and say so."""
+    held = any(row.get("focal_held") for row in found.tried if row["chosen"])
+    priors = {number: camera.mean_focal_length() for number, camera in found.verified.cameras.items()} if held else {}
+    corrected = correct_rolling_shutter(found.model, found.verified, film, priors, config.seed)
+    report_shutter(corrected, report)
+    return corrected
 
 
 def _capture(inputs: Inputs, scratch: Path) -> MappingInput:

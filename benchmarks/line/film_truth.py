@@ -1,4 +1,4 @@
-"""A film with known truth through the line: ``film_truth SPLAT WORK [--seconds 60] [--rolling] [--until evaluate]``.
+"""A film with known truth through the line: ``film_truth SPLAT WORK [--seconds 60] [--fps 30] [--rolling]``.
 
 SPLAT is a finished splat in local metres, z up (the demo's ``splat.ply`` or ``clean``'s ``model.ply``). A flight around
 it, at a height that changes by half, is drawn by splatpipe's rasterizer: each frame is the mean, in linear light, of
@@ -196,6 +196,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--turns", type=float, default=2.0)
     parser.add_argument("--size", default="1920x1080")
+    parser.add_argument("--fps", type=int, default=30, help="fewer draw faster; the flight stays the same")
     parser.add_argument("--moments", type=int, default=4)
     parser.add_argument("--exposure", type=float, default=1.0 / 120.0, help="seconds")
     parser.add_argument("--rolling", action="store_true", help="a rolling shutter of 1/60 s")
@@ -205,7 +206,9 @@ def main() -> None:
     options = parser.parse_args()
     width, height = map(int, options.size.split("x"))
     readout_s = 1.0 / 60.0 if options.rolling else 0.0
-    flight = Flight(options.seconds, options.turns, 30, width, height, options.exposure, readout_s, options.moments)
+    flight = Flight(
+        options.seconds, options.turns, options.fps, width, height, options.exposure, readout_s, options.moments
+    )
     gaussians = read_splat(options.splat)
     rendering = RenderOptions(
         sh_degree=gaussians.sh_degree, background=(0.62, 0.72, 0.82), antialias=True, near=0.05, depth=False

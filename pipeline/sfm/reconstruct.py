@@ -14,7 +14,7 @@ import pycolmap
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.judging.judging import Judgement, judge
-from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, adjust_within, focal_sigmas
+from splatpipe.pipeline.sfm.lenses.focal import MAX_UNOBSERVED_DEVIATION, UNOBSERVED, adjust_within, focal_sigmas
 from splatpipe.pipeline.sfm.mapping.completion import complete
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options, map_global, map_incremental
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
@@ -44,7 +44,6 @@ MIN_SHARE = 0.1  # share of the photos in a model; one of fewer is accidental
 MIN_SEEN = 15  # mean points per photo; COLMAP's minimum for a pair
 ENOUGH_SHARE = 0.5  # below this share, an attempt with relaxed thresholds is worth its time
 MAX_SHARE = 0.85  # below this share the other mapper may do better; above it the ladder places the rest more cheaply
-MAX_UNOBSERVED_DEVIATION = 0.03  # relative deviation allowed for a focal length that the photos do not determine
 MIN_SCORE_MARGIN = 0.005  # score margin by which a second model must be better to replace the first
 ROUNDS = 2  # rounds of matching additional pairs
 MAX_FURTHER_MAPPINGS = 1  # mappings of a doubtful capture

@@ -79,7 +79,7 @@ def read_capture(
     """
     root, filmed = photo_root(source.folder), []
     if is_film(root):
-        issues = extract_frames(root, scratch, config.ingest, threads, report)
+        issues, _ = extract_frames(root, scratch, config.ingest, threads, report)
         root, filmed = scratch, [finding_from_issue(issue) for issue in issues]
     work = Preparation(config.ingest, threads, root, report)
     with warnings.catch_warnings():
@@ -92,7 +92,11 @@ def read_capture(
             findings = [Finding("bands", "error", error.message, error.hint)]
         masked = [find_mask_issues(kind, photo_root(source.folder), chosen, work) for kind in (MASKS, SKIES)]
     photos = chosen.photos
-    findings += [*filmed, *_left_out(chosen), *(finding_from_issue(issue) for issues in masked for issue in issues)]
+    findings += [
+        *filmed,
+        *_left_out(chosen, config.ingest.masks),
+        *(finding_from_issue(issue) for issues in masked for issue in issues),
+    ]
     names = [photo.name for photo in photos]
     few = explain_too_few(source.folder, Path(source.folder.name), names, chosen.pictures_left_out, chosen.scan.others)
     if few is not None:
@@ -170,7 +174,7 @@ def _file_places(
     return places, [Finding("positions-file", "warning", text, hint)]
 
 
-def _left_out(chosen: Selection) -> list[Finding]:
+def _left_out(chosen: Selection, masks: bool) -> list[Finding]:
     """One finding per reason, for all duplicates one, and one for files that belong to photos."""
     of_kind = {
         kind: [entry for entry in chosen.left_out if entry.kind == kind]
@@ -187,7 +191,8 @@ def _left_out(chosen: Selection) -> list[Finding]:
         findings.append(Finding("bands", "note", chosen.note))
     if chosen.masks:
         names = [mask.name for mask in chosen.masks]
-        findings.append(Finding("companions", "note", f"Masks of photos: {list_names(names)}.", "A run applies them."))
+        use = "A run applies them." if masks else "A run leaves them unused, by ingest.masks=false."
+        findings.append(Finding("companions", "note", f"Masks of photos: {list_names(names)}.", use))
     return findings
 
 

@@ -315,9 +315,8 @@ def _georeference(inputs: ReportInputs) -> VerdictLine | None:
         )
         return VerdictLine("doubt", "Accuracy", text)
     gps = tables.get("gps") or {}
-    off = (
-        f"they scatter by {length(gps.get('rmse_horizontal_m'))} horizontally, {length(gps.get('rmse_up_m'))} in height"
-    )
+    height = "" if gps.get("rmse_up_m") is None else f", {length(gps['rmse_up_m'])} in height"
+    off = f"they scatter by {length(gps.get('rmse_horizontal_m'))} horizontally{height}"
     uncertainty = (report.get("uncertainty") or {}).get("sentence")
     worth = f", {uncertainty}" if uncertainty else ""
     text = (

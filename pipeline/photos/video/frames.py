@@ -25,6 +25,7 @@ from splatpipe.pipeline.photos.intake.capture_issues import CaptureIssue
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.video.boxes import Container, read_container
 from splatpipe.pipeline.photos.video.choice import Choice, choose
+from splatpipe.pipeline.photos.video.film_times import FilmTimes
 from splatpipe.pipeline.photos.video.measuring import measure_film, open_film
 from splatpipe.pipeline.photos.video.motion import Measures
 from splatpipe.pipeline.photos.video.telemetry import FlightPath, Place, read_fixes, read_subtitles
@@ -59,7 +60,7 @@ class Flight:
 
 def extract_frames(
     film: Path, folder: Path, config: IngestConfig, threads: int, report: Reporter, kept: Path | None = None
-) -> list[CaptureIssue]:
+) -> tuple[list[CaptureIssue], FilmTimes]:
     """Choose a film's frames and write them into a folder.
 
     Args:
@@ -71,7 +72,7 @@ def extract_frames(
         kept: File of what was measured, from which a killed run goes on; None: nothing is kept.
 
     Returns:
-        What is to be told of the film.
+        What is to be told of the film, and when the frames were taken.
 
     Raises:
         SplatpipeError: if it cannot be decoded, or has too few different frames.
@@ -92,8 +93,13 @@ def extract_frames(
             f"{name} shows too little: only {len(choice.chosen)} of its {container.frames:,} frames differ.",
             hint="A reconstruction needs a camera that moves past its subject.",
         )
-    _write(film, folder, _frames_of(film, container, measures, choice, flight), threads, report)
-    return _issues(film, container, measures, choice, flight)
+    frames = _frames_of(film, container, measures, choice, flight)
+    _write(film, folder, frames, threads, report)
+    times = {
+        frame.name: float(measures.times_s[index]) for frame, index in zip(frames, choice.chosen.tolist(), strict=True)
+    }
+    taken = FilmTimes(container.seconds / container.frames, times, choice.cuts_s)
+    return _issues(film, container, measures, choice, flight), taken
 
 
 @dataclass(frozen=True)
@@ -279,7 +285,7 @@ def _shutter_issues(container: Container, measures: Measures, name: str) -> list
         text = (
             f"The picture in {name} moves by {pixels:.0f} pixels a frame: a rolling shutter, as most films are taken "
         )
-        text += "with, shears it by up to as much, which is not corrected."
+        text += "with, shears it by up to as much. A run corrects the cameras for that, but not the pictures."
         found.append(CaptureIssue("film-shutter", text, "Fly slower, or take photos."))
     return found
 

@@ -20,6 +20,7 @@ from splatpipe.pipeline.sfm.lenses.lens_blocks import keep_shape
 from splatpipe.pipeline.sfm.mapping.completion import ROBUST_PX
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 
+MAX_UNOBSERVED_DEVIATION = 0.03  # relative deviation allowed for a focal length that the photos do not determine
 UNOBSERVED = 0.01  # relative standard deviation above which the photos do not determine a focal length
 PRINCIPAL_POINT_SIGMA = 0.01  # prior standard deviation of the principal point over the image width
 MAX_DENSE = 60  # photos up to which the reduced system is solved densely

@@ -17,11 +17,11 @@ from types import MappingProxyType
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
-from splatpipe.pipeline.sfm.lenses.held_out import MIN_VIEWS, of_photos, tracks_of
+from splatpipe.pipeline.sfm.lenses.held_out import of_photos, tracks_of
 from splatpipe.pipeline.sfm.lenses.lens_adjustment import BASE, LensFreedom, adjust_lenses, weak_prior
 from splatpipe.pipeline.sfm.lenses.lens_model import (
     StatedLens,
@@ -33,12 +33,11 @@ from splatpipe.pipeline.sfm.lenses.lens_model import (
     widen,
 )
 from splatpipe.pipeline.sfm.lenses.lens_trial import LensState, LensTrial
+from splatpipe.pipeline.sfm.lenses.track_choice import MIN_TRACKS, decision_tracks, with_only
 from splatpipe.pipeline.sfm.mapping.retriangulation import MAX_ERROR_PX, retriangulate
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 MIN_PHOTOS = 8  # photos of a camera: fewer cannot separate its lens from their poses
-MIN_TRACKS = 400  # tracks used for the decision; fewer are inconclusive
-MAX_TRACKS = 6000  # some 30,000 observations for a dozen unknowns per camera
 HELD_OUT = 0.25
 MAX_STATED_DEVIATION = 2e-3  # deviation from a calibration over the width that is reported: twice the usual
 WORDS = {
@@ -50,8 +49,6 @@ WORDS = {
     "fisheye": "a fisheye's projection",
     "stated": "as it is stated",
 }
-WANTED_PER_PHOTO = 80  # tracks used for the decision
-MIN_PER_PHOTO = 20  # adjusted tracks: six unknowns need more than three points
 
 
 def calibrate(
@@ -70,13 +67,13 @@ def calibrate(
         The model itself if every lens stays simple, otherwise a new one; and a row per camera for ``models.json``.
     """
     usable = {number: lens for number, lens in stated.items() if number in model.cameras}
-    chosen = _decision_tracks(model, seed)
+    chosen = decision_tracks(model, seed)
     if how == "simple" or (len(chosen) < MIN_TRACKS and not usable):
         return model, ()
     if len(chosen) < MIN_TRACKS:
         return _with_held(model, verified, usable, seed)
     held_out, deciding = np.split(chosen, [round(HELD_OUT * len(chosen))])
-    within = _only(model, set(deciding.tolist()))
+    within = with_only(model, set(deciding.tolist()))
     states = _states(within, model)
     if not usable and not any(state.freedom.free for state in states.values()):
         return model, _rows(model, model, states)
@@ -95,7 +92,7 @@ def _with_held(
     model: pycolmap.Reconstruction, verified: ViewGraph, stated: Mapping[int, StatedLens], seed: int
 ) -> tuple[pycolmap.Reconstruction, tuple[JSON, ...]]:
     """Return the model with its stated lenses fixed, for when there are too few tracks to test them."""
-    lensed = _only(model, set(model.points3D))
+    lensed = with_only(model, set(model.points3D))
     states = {}
     for number, camera in lensed.cameras.items():
         states[number] = LensState(LensFreedom((), weak_prior(camera)), focal_determined=False)
@@ -106,28 +103,6 @@ def _with_held(
             states[number] = replace(states[number], changed=True, stated=stated[number].source, freed=("stated",))
     result = _finished(model, verified, lensed, states, seed)
     return result, _rows(model, result, states, stated)
-
-
-def _decision_tracks(model: pycolmap.Reconstruction, seed: int) -> Int64[np.ndarray, " k"]:
-    """Choose the points used for the decision, in a seeded order.
-
-    Only points seen by three photos or more; up to ``MAX_TRACKS``, and beyond that only those of photos that still
-    have too few.
-    """
-    numbers = np.array(
-        sorted(number for number, point in model.points3D.items() if point.track.length() >= MIN_VIEWS), np.int64
-    )
-    mixed = np.random.default_rng(seed).permutation(numbers)
-    if len(mixed) <= MAX_TRACKS:
-        return np.asarray(mixed)
-    seen: Counter[int] = Counter()
-    taken = []
-    for place, number in enumerate(mixed.tolist()):
-        photos = {element.image_id for element in model.points3D[number].track.elements}
-        if place < MAX_TRACKS or any(seen[photo] < WANTED_PER_PHOTO for photo in photos):
-            seen.update(photos)
-            taken.append(number)
-    return np.random.default_rng(seed).permutation(np.array(taken, np.int64))
 
 
 def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> dict[int, LensState]:
@@ -146,27 +121,6 @@ def _states(within: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> 
         free = BASE if determined and counts[number] >= MIN_PHOTOS and is_known(camera.model_name) else ()
         states[number] = LensState(LensFreedom(free, weak_prior(camera)), determined)
     return states
-
-
-def _only(model: pycolmap.Reconstruction, points: set[int]) -> pycolmap.Reconstruction:
-    """Return a copy with only some of the points, the photos with enough of them, and cameras of the wide models."""
-    copy = pycolmap.Reconstruction(model)
-    for number in sorted(copy.points3D):
-        if number not in points:
-            copy.delete_point3D(number)
-    seen = Counter(element.image_id for point in copy.points3D.values() for element in point.track.elements)
-    observations = pycolmap.ObservationManager(copy)
-    for number in sorted(copy.reg_image_ids()):
-        if seen[number] < MIN_PER_PHOTO:
-            observations.deregister_frame(copy.images[number].frame_id)
-    copy.tear_down()  # COLMAP's covariance needs a pose for every photo in the model
-    for number, camera in sorted(model.cameras.items()):
-        if not copy.exists_camera(number):
-            copy.add_camera_with_trivial_rig(camera)
-    for camera in copy.cameras.values():
-        if is_known(camera.model_name):
-            widen(camera)
-    return copy
 
 
 def _finished(

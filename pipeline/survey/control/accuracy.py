@@ -97,7 +97,10 @@ def accuracy_json(
     if site is not None and len(site.stations):
         stations = site.stations
         centres = placed.world_from_model.apply(placed.model.centres[stations.indices])
-        table = accuracy_table(centres + placed.offsets[stations.group] - site.station_enu)
+        residuals = centres + placed.offsets[stations.group] - site.station_enu
+        if not stations.with_heights:
+            residuals[:, 2] = np.nan  # the model's own heights tell nothing of the positions
+        table = accuracy_table(residuals)
         flights = [
             {"flight": number, "photos": int((stations.group == k).sum()), "offset_m": placed.offsets[k].tolist()}
             for k, number in enumerate(stations.flights)

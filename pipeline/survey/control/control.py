@@ -238,7 +238,7 @@ def _without_one(trusted: _TrustedAdjustment, case: _Case) -> tuple[int, float, 
         if rest.noise <= limit and not rest.done.adjusted.converged:
             rest = _try(others, trusted.factor, case)
         if rest.noise <= limit:
-            model = model_of(rest.done.reconstruction, capture.photos)
+            model = model_of(rest.done.reconstruction, capture.photos, capture.model.shutter)
             found = locate(trusted.survey.points[index], model, capture.photos, case.config.mark_sigma_px).found
             if found is not None:
                 known = np.isfinite(result.site.targets.sigmas[index])
@@ -288,7 +288,7 @@ def _adjusted(
     )
     world_from_model = result.placed.world_from_model
     adjusted = done.reconstruction
-    model = model_of(adjusted, capture.photos)
+    model = model_of(adjusted, capture.photos, capture.model.shutter)
     points = [
         locate(point, model, capture.photos, config.mark_sigma_px) if point.found is not None else point
         for point in survey.points
@@ -389,10 +389,12 @@ def _marks(
 ) -> tuple[list[tuple[int, Float64[np.ndarray, " 2"]]], Float64[np.ndarray, " m"]]:
     """Marks, given by the model's photo, its name and the photo's pixel, in the model's pixels; with their sigmas."""
     model = case.capture.model
-    scales = [model.view(index, case.capture.photos[photo].width).scale for index, photo, _ in seen]
+    views = [model.view(index, case.capture.photos[photo].width) for index, photo, _ in seen]
     marks = [
-        (model.image_ids[index], np.array(pixel) * scale) for (index, _, pixel), scale in zip(seen, scales, strict=True)
+        (model.image_ids[index], view.still(np.array(pixel)) * view.scale)
+        for (index, _, pixel), view in zip(seen, views, strict=True)
     ]
+    scales = [view.scale for view in views]
     return marks, case.config.mark_sigma_px * np.array(scales)
 
 

@@ -45,6 +45,7 @@ class Stations:
         group: Index of the flight.
         flights: Their numbers, by that index.
         absolute: Whether their heights are above a datum; else above take-off, or assumed.
+        with_heights: Whether their heights are stated; else they are the model's own.
     """
 
     names: tuple[str, ...]
@@ -54,6 +55,7 @@ class Stations:
     group: Int64[np.ndarray, " n"]
     flights: tuple[int, ...]
     absolute: bool = True
+    with_heights: bool = True
 
     def __len__(self) -> int:
         return len(self.names)
@@ -118,6 +120,7 @@ def stations_of(model: SparseModel, positions: Positions, frame: Frame | None) -
         np.array([flights.index(int(r.get("flight", 0))) for _, _, r in rows], dtype=np.int64),
         tuple(flights),
         all(record.get("altitude_source", "") not in ("takeoff", ASSUMED) for _, _, record in rows),
+        all(record.get("altitude_source", "") != ASSUMED for _, _, record in rows),
     )
 
 

@@ -44,6 +44,8 @@ MISWRITTEN = (  # what a number may have been meant to be, and how to write it
     (re.compile("[°º]|[0-9] *[NSEW]$"), "Write degrees with decimals, negative in the south and west: 13.512690."),
     (re.compile("^[0-9]{1,3}(?:['’,. ][0-9]{3})+"), "Write numbers without signs between thousands: 388710.51."),
 )
+WHOLE, DECIMALS = re.compile(r"[+-]?\d+"), re.compile(r"\d+")  # a number's parts on both sides of a decimal comma
+ORTHOMETRIC = ("elevation", "elev")  # beside a column of ellipsoidal heights called height, in Trimble's tables
 CONTROL_CHARACTERS = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
 
 
@@ -304,6 +306,8 @@ def csv_rows(
             cells = cells_of(text, delimiter)
         except csv.Error as error:
             raise LineError(number, str(error)) from error
+        if delimiter == "," and len(cells) >= len(titles) + 2:
+            _require_decimal_points(number, cells, places)
         place = places.get("crs", len(cells))
         stated = crs_text(cells[place]) if place < len(cells) else ""
         if stated and crs and crs.casefold() != stated.casefold():
@@ -311,6 +315,7 @@ def csv_rows(
         crs = stated or crs
         rows.append((number, _whole(cells, titles, places) if delimiter == " " else cells))
     places, crs = _with_degrees(titles, places, crs)
+    places = _with_grid(titles, places, crs, columns)
     if not crs:
         raise LineError(0, "it states no CRS", "Put it in the first line, e.g. EPSG:32633, or in a column crs.")
     named: list[tuple[int, Mapping[str, str]]] = [
@@ -318,6 +323,46 @@ def csv_rows(
         for number, cells in rows
     ]
     return crs, named
+
+
+def _require_decimal_points(number: int, cells: Sequence[str], places: Mapping[str, int]) -> None:
+    """Reject coordinates with decimal commas in a table that commas separate: their halves would be read as numbers.
+
+    Raises:
+        LineError: if all coordinates are two whole numbers each.
+    """
+    of_coordinates = [places[name] for name in ("x", "y", "z") if name in places]
+    halves = [cell.strip() for cell in cells[min(of_coordinates, default=0) :][: 2 * len(of_coordinates)]]
+    whole = all(map(WHOLE.fullmatch, halves[::2])) and all(map(DECIMALS.fullmatch, halves[1::2]))
+    if halves and whole:
+        raise LineError(
+            number,
+            "commas separate both the columns and the decimals",
+            "Separate the columns by semicolons, or write decimals with points.",
+        )
+
+
+def _with_grid(
+    titles: Sequence[str], places: Mapping[str, int], crs: str, columns: Mapping[str, tuple[str, ...]]
+) -> dict[str, int]:
+    """The columns of a table of both degrees and a projected CRS's coordinates: these, if it states such a CRS."""
+    if not crs or title_of(titles[places["x"]]) not in GEOGRAPHIC:
+        return dict(places)
+    degrees = {*GEOGRAPHIC, *GEOGRAPHIC_Y, *ELLIPSOIDAL_Z}
+    grid = find_columns(titles, {name: [each for each in columns[name] if each not in degrees] for name in "xyz"})
+    if "x" not in grid or "y" not in grid or _is_geographic(crs):
+        return dict(places)
+    heights = [at for at, title in enumerate(titles) if title_of(title) in ORTHOMETRIC]
+    return {**places, **grid, **({"z": heights[0]} if heights else {})}
+
+
+def _is_geographic(text: str) -> bool:
+    from splatpipe.pipeline.survey.crs.crs_names import parse_crs  # loads PROJ, which few tables need here
+
+    try:
+        return parse_crs(text).is_geographic
+    except SplatpipeError:
+        return True  # unknown: the message says so, once the table is read
 
 
 def _whole(cells: Sequence[str], titles: Sequence[str], places: Mapping[str, int]) -> list[str]:

@@ -19,6 +19,7 @@ from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.photos.colmap.colmap_reconstruction import read_reconstruction
 from splatpipe.pipeline.photos.files.names import list_names, match_names
+from splatpipe.pipeline.sfm.shutter.frame_shutter import FilmShutter, FrameShutter, frame_shutter, load_film_shutter
 
 RAY_STEP = 1e-5  # step in x/z for finite differences: about a hundredth of a pixel
 
@@ -31,15 +32,22 @@ class ModelView:
         camera: COLMAP's camera, with its distortion.
         cam_from_model: Pose.
         scale: Camera pixels per photo pixel.
+        shutter: Of a film's frame whose keypoints are corrected for a rolling shutter: pixels of rays and of points
+            are those of the frame as it was taken.
     """
 
     camera: pycolmap.Camera
     cam_from_model: Float64[np.ndarray, "3 4"]
     scale: float
+    shutter: FrameShutter | None = None
+
+    def still(self, pixel: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
+        """A pixel of the photo as it would be, had all rows been exposed together; but for films, the pixel itself."""
+        return pixel if self.shutter is None else self.shutter.still(pixel * self.scale) / self.scale
 
     def ray(self, pixel: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
         """x/z and y/z of the ray through a pixel of the photo; not finite where the lens model is undefined."""
-        found = self.camera.cam_from_img((pixel * self.scale)[None])
+        found = self.camera.cam_from_img((self.still(pixel) * self.scale)[None])
         return np.full(2, np.nan) if found is None else np.asarray(found, np.float64).reshape(2)
 
     def pixels_by_ray(self, ray: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "2 2"]:
@@ -55,7 +63,8 @@ class ModelView:
     def pixel(self, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 2"]:
         """Project a point of the model into the photo, in pixels; not finite behind the camera."""
         pixels, _ = project_through_lens(self.camera, self.cam_from_model, point[None])
-        return np.asarray(pixels[0] / self.scale)
+        found = pixels[0] if self.shutter is None else self.shutter.taken(pixels[0], point)
+        return np.asarray(found / self.scale)
 
 
 @dataclass(frozen=True)
@@ -69,6 +78,7 @@ class SparseModel:
         points: The sparse cloud.
         image_ids: COLMAP's image ids of the photos.
         reconstruction: The COLMAP reconstruction behind all this.
+        shutter: The rolling shutter that a film's keypoints are corrected for.
     """
 
     names: list[str]
@@ -77,6 +87,7 @@ class SparseModel:
     points: Float64[np.ndarray, "m 3"]
     image_ids: tuple[int, ...]
     reconstruction: pycolmap.Reconstruction
+    shutter: FilmShutter | None = None
 
     def view(self, index: int, width: int) -> ModelView:
         """A photo's camera.
@@ -85,9 +96,11 @@ class SparseModel:
             index: Index of the photo.
             width: Width of the photo in which pixels are given; the model may have been made from smaller photos.
         """
-        image = self.reconstruction.images[self.image_ids[index]]
+        number = self.image_ids[index]
+        image = self.reconstruction.images[number]
         camera = self.reconstruction.cameras[image.camera_id]
-        return ModelView(camera, np.asarray(image.cam_from_world().matrix(), np.float64), camera.width / width)
+        shutter = None if self.shutter is None else frame_shutter(self.reconstruction, number, self.shutter)
+        return ModelView(camera, np.asarray(image.cam_from_world().matrix(), np.float64), camera.width / width, shutter)
 
     def gsd(self, scale: float) -> float | None:
         """Ground sampling distance (GSD) in a world ``scale`` times larger: the median of the photos' medians."""
@@ -116,11 +129,19 @@ def read_model(path: Path, photos: Iterable[str]) -> SparseModel:
     reconstruction = read_reconstruction(path)
     if not any(image.has_pose for image in reconstruction.images.values()):
         raise SplatpipeError("The sparse model has no photo with a pose.", "Reconstruct again, with more overlap.")
-    return model_of(reconstruction, photos)
+    return model_of(reconstruction, photos, load_film_shutter(path))
 
 
-def model_of(reconstruction: pycolmap.Reconstruction, photos: Iterable[str]) -> SparseModel:
-    """Extract what georef uses from a reconstruction; ``photos`` are the names that ingest gave the photos."""
+def model_of(
+    reconstruction: pycolmap.Reconstruction, photos: Iterable[str], shutter: FilmShutter | None = None
+) -> SparseModel:
+    """Extract what georef uses from a reconstruction.
+
+    Args:
+        reconstruction: The model.
+        photos: The names that ingest gave the photos.
+        shutter: The rolling shutter that a film's keypoints are corrected for.
+    """
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
     poses = np.stack([np.asarray(image.cam_from_world().matrix(), dtype=np.float64) for image in images])
     rotations = poses[:, :, :3]
@@ -132,7 +153,7 @@ def model_of(reconstruction: pycolmap.Reconstruction, photos: Iterable[str]) -> 
     names = [matched.get(image.name, image.name) for image, good in zip(images, finite, strict=True) if good]
     ids = tuple(image.image_id for image, good in zip(images, finite, strict=True) if good)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
-    return SparseModel(names, centres[finite], rotations[finite], cloud, ids, reconstruction)
+    return SparseModel(names, centres[finite], rotations[finite], cloud, ids, reconstruction, shutter)
 
 
 def report_choice(folder: Path, report: Reporter) -> None:

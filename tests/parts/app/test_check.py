@@ -272,7 +272,12 @@ def test_masks_are_checked_as_in_a_run(tmp_path: Path) -> None:
         (name(5),): "The mask of DJI_0005.JPG hides almost the whole photo: black areas are ignored.",
     }
     assert {issue.severity for issue in issues} == {"warning"}
-    assert found(examined(photos, "ingest.masks=false"), "masks") == []
+    assert [issue.hint for issue in found(examined(photos), "companions")] == ["A run applies them."]
+    unmasked = examined(photos, "ingest.masks=false")
+    assert found(unmasked, "masks") == []
+    assert [issue.hint for issue in found(unmasked, "companions")] == [
+        "A run leaves them unused, by ingest.masks=false."
+    ]
 
 
 def test_several_models_are_told(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from splatpipe.pipeline.photos.files.photo_list import decode, load_photo_list
 from splatpipe.pipeline.photos.metadata.exif import read_exif
 from splatpipe.pipeline.photos.options import IngestConfig
 from splatpipe.pipeline.photos.video import frames, measuring
+from splatpipe.pipeline.photos.video.film_times import load_film_times
 from splatpipe.pipeline.photos.video.frames import extract_frames
 from splatpipe.pipeline.photos.video.motion import FilmMeter
 from splatpipe.stages.line import LINE
@@ -74,6 +75,9 @@ def test_frames_are_photos_with_positions_and_times(flown: Path, tmp_path: Path)
         assert position["altitude_m"] == pytest.approx(545.0 + 10.0 * time_s, abs=0.02)
         assert position["relative_altitude_m"] == 30.0
         assert decode(photo, folder / "photos", flown / "flight.mp4").shape == (HEIGHT, WIDTH, 3)
+    film = load_film_times(folder / "photos")
+    assert film is not None and film.frame_s == pytest.approx(1.0 / FPS) and film.cuts_s == ()
+    assert film.times_s == {photo.name: pytest.approx(int(photo.name[-10:-4]) / FPS, abs=1e-3) for photo in photos}
     messages = " ".join(event.data.get("message", "") for event in events)
     assert "frames in 3.0 s are used" in messages and "are from flight.SRT" in messages
     camera = json.loads((folder / "cameras.json").read_text())
@@ -173,7 +177,7 @@ def test_masks_and_survey_files_lie_beside_a_film(flown: Path, tmp_path: Path) -
 
 def test_at_most_so_many_frames(flown: Path, tmp_path: Path) -> None:
     quiet = EventReporter("x", lambda _event: None)
-    issues = extract_frames(flown / "flight.mp4", tmp_path / "few", IngestConfig(max_frames=4), 1, quiet)
+    issues, _ = extract_frames(flown / "flight.mp4", tmp_path / "few", IngestConfig(max_frames=4), 1, quiet)
     assert len(list((tmp_path / "few").iterdir())) == 4
     assert any(issue.code == "film-frames" and "ingest.max_frames=4" in issue.message for issue in issues)
 
@@ -185,7 +189,7 @@ def test_frames_are_turned_by_exif_alone_and_a_film_without_positions_says_so(fl
     at = data.index(upright, data.index(b"tkhd"))
     (tmp_path / "turned.mov").write_bytes(data[:at] + turned + data[at + len(upright) :])
     quiet = EventReporter("x", lambda _event: None)
-    issues = extract_frames(tmp_path / "turned.mov", tmp_path / "frames", IngestConfig(), 1, quiet)
+    issues, _ = extract_frames(tmp_path / "turned.mov", tmp_path / "frames", IngestConfig(), 1, quiet)
     with Image.open(next((tmp_path / "frames").iterdir())) as picture:
         assert picture.size == (WIDTH, HEIGHT) and read_exif(picture).orientation == 6
         assert read_exif(picture).gps is None

@@ -207,3 +207,55 @@ def test_a_german_spreadsheets_table_is_read(tmp_path: Path) -> None:
     [point] = read_control_file(path).points
     assert (point.name, point.x, point.y, point.z) == ("P1", 388710.51, 5299705.21, 512.01)
     assert [(mark.photo, mark.x, mark.y) for mark in point.marks] == [("Münster_1.JPG", 112.1, 514.1)]
+
+
+TRIMBLE = (("P01", "5299705.214", "388710.512", "512.013", "GCP"), ("P02", "5299720.5", "388722.75", "512.44", "CHK"))
+
+
+@pytest.mark.parametrize("decimals", [".", ","])
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize(
+    "titles",
+    [
+        "Point ID,Northing,Easting,Elevation,Code",
+        "Point ID,Northing (Meter),Easting (Meter),Elevation (Meter),Feature Code",
+        "P,N,E,Z,D",
+        "Point,North,East,Elev,Code",
+        "Name,Grid Northing,Grid Easting,Elevation,Feature Code",
+        "Punkt-Nr,Hochwert,Rechtswert,Höhe,Code",
+    ],
+)
+def test_trimbles_tables_are_read(tmp_path: Path, titles: str, separator: str, decimals: str) -> None:
+    rows = [[cell.replace(".", decimals) for cell in row] for row in TRIMBLE]
+    lines = ["EPSG:32633", titles.replace(",", separator), *(separator.join(row) for row in rows)]
+    path = tmp_path / "control.csv"
+    path.write_text("\r\n".join(lines), encoding="utf-8")
+    if (separator, decimals) == (",", ","):
+        with pytest.raises(
+            SplatpipeError, match=r"Line 3 .*commas separate both the columns and the decimals"
+        ) as error:
+            read_points_file(path)
+        assert "semicolons" in error.value.hint
+        return
+    points = read_points_file(path).points
+    assert [(point.name, point.x, point.y, point.z) for point in points] == [
+        ("P01", 388710.512, 5299705.214, 512.013),
+        ("P02", 388722.75, 5299720.5, 512.44),
+    ]
+
+
+def test_a_table_of_degrees_and_a_projected_crs_is_read_in_the_one_it_states(tmp_path: Path) -> None:
+    path = tmp_path / "control.csv"
+    table = "Point ID,Latitude,Longitude,Height,Northing,Easting,Elevation\nP1,47.84,13.51,558.1,5299705,388710,512.0\n"
+    for crs, place in (("EPSG:32633", (388710.0, 5299705.0, 512.0)), ("EPSG:4326", (13.51, 47.84, 558.1))):
+        path.write_text(f"{crs}\n{table}")
+        (point,) = read_points_file(path).points
+        assert (point.x, point.y, point.z) == place
+    path.write_text(table)
+    (point,) = read_points_file(path).points
+    assert (point.x, point.y, point.z) == (13.51, 47.84, 558.1)
+
+
+def test_a_header_without_a_photos_column_says_so(tmp_path: Path) -> None:
+    with pytest.raises(SplatpipeError, match="a header without the columns photo, pixel_x, pixel_y"):
+        read(tmp_path, "EPSG:32633\nnumber,x,y,z\n1,2,3,4\n")

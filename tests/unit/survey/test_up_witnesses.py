@@ -9,6 +9,8 @@ import pytest
 
 from splatpipe.pipeline.geometry.similarity import Similarity, rotation_from_vector
 from splatpipe.pipeline.geometry.upright import enu_from_gimbal
+from splatpipe.pipeline.survey.control.accuracy import GeoreferencedModel, accuracy_json
+from splatpipe.pipeline.survey.control.local_survey import LocalSurvey, Targets, stations_of
 from splatpipe.pipeline.survey.crs.frames import Frame, Origin
 from splatpipe.pipeline.survey.placing.assumed_heights import with_assumed_heights
 from splatpipe.pipeline.survey.placing.fitting import FrameUndeterminedError
@@ -130,7 +132,8 @@ def test_a_camera_mounted_upside_down_is_outvoted() -> None:
 
 def test_horizontal_positions_alone_place_a_model_with_arbitrary_heights() -> None:
     model, positions = scene(altitude_m=None)
-    frame, fit = georeference(model, with_assumed_heights(model, positions), "auto", {})
+    assumed = with_assumed_heights(model, positions)
+    frame, fit = georeference(model, assumed, "auto", {})
     assert up_of(frame) > np.cos(np.radians(3.0))
     assert frame.world_from_model.scale == pytest.approx(TRUTH.scale, rel=0.02)
     assert frame.origin is not None
@@ -138,6 +141,13 @@ def test_horizontal_positions_alone_place_a_model_with_arbitrary_heights() -> No
     assert np.abs((PLACE.enu_from_geodetic(placed) - RING)[:, :2]).max() < 2.0
     assert "heights are arbitrary" in frame.note and "horizontal positions" in frame.note
     assert np.degrees(fit.uncertainty.up_rad) > 3.0
+    stations = stations_of(model, assumed, frame)
+    nothing = Targets(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+    site = LocalSurvey(frame.origin, nothing, stations, frame.origin.enu_from_geodetic(stations.geodetic))
+    table = accuracy_json(None, site, GeoreferencedModel(model, frame.world_from_model, np.zeros((1, 3))), None)[
+        "tables"
+    ]
+    assert table["gps"]["rmse_horizontal_m"] is not None and table["gps"]["rmse_up_m"] is None
 
 
 def test_stated_altitudes_are_kept() -> None:
