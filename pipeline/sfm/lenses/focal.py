@@ -25,7 +25,7 @@ UNOBSERVED = 0.01  # relative standard deviation above which the photos do not d
 PRINCIPAL_POINT_SIGMA = 0.01  # prior standard deviation of the principal point over the image width
 MAX_DENSE = 60  # photos up to which the reduced system is solved densely
 MAX_ITERATIONS = 60
-FUNCTION_TOLERANCE = 1e-5
+FUNCTION_TOLERANCE = 1e-6
 EXTRA_SIGMA = 0.2  # prior standard deviation of a distortion coefficient: no lens has larger ones
 
 
