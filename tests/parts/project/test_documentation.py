@@ -202,7 +202,7 @@ def test_the_page_of_options_has_types_limits_and_presets() -> None:
     }
     assert set(rows) == {name for name in option_names(LineConfig) if "." in name}
     assert "| `auto` or whole number, at least 1 | `auto` |" in rows["train.iterations"]
-    assert "| `sift`, `opencv-sift` | `sift` | demo `opencv-sift`; preview `opencv-sift` |" in rows["features.extractor"]
+    assert "| `sift` | demo `opencv-sift`; preview `opencv-sift` |" in rows["features.extractor"]
     assert "| `true`, `false` | `false` |" in rows["export.sky"]
     assert "| number, at least 0, below 1 | `0` |" in rows["train.stop_when_flat"]
 
