@@ -27,25 +27,26 @@ struct ByteProducts {
     static SPLAT_METHOD void pack(const uint8_t* values, int count, const NearestScratch& scratch) {
         int32_t* packed = static_cast<int32_t*>(scratch.packed);
         int32_t* sums = packed + kBlock * kSteps;
-        for (int first = 0; first < count; first += 4 * kLanes)
-            for (int from = first; from < first + 4 * kLanes; from += kLanes) {
-                const int here = count - from < kLanes ? count - from : kLanes;
-                const float* rows = reinterpret_cast<const float*>(values + from * kDescriptor);
-                if (here < kLanes) {
-                    memset(scratch.rows, 0, kLanes * kDescriptor);
-                    if (here > 0) memcpy(scratch.rows, values + from * kDescriptor, here * kDescriptor);
-                    rows = scratch.rows;
-                }
-                Floats columns[kSteps];
-                load_columns(rows, kSteps, kSteps, columns);
-                __m512i sum = _mm512_setzero_si512();
-                for (int k = 0; k < kSteps; ++k) {
-                    const __m512i four = _mm512_castps_si512(columns[k]);
-                    _mm512_storeu_si512(packed + from * kSteps + k * kLanes, four);
-                    sum = _mm512_dpbusd_epi32(sum, four, _mm512_set1_epi8(1));
-                }
-                _mm512_storeu_si512(sums + from, _mm512_slli_epi32(sum, 7));
+        constexpr int kColumns = kVectors * kLanes;
+        const int end = (count + kColumns - 1) / kColumns * kColumns;
+        for (int from = 0; from < end; from += kLanes) {
+            const int here = count - from < kLanes ? count - from : kLanes;
+            const float* rows = reinterpret_cast<const float*>(values + from * kDescriptor);
+            if (here < kLanes) {
+                memset(scratch.rows, 0, kLanes * kDescriptor);
+                if (here > 0) memcpy(scratch.rows, values + from * kDescriptor, here * kDescriptor);
+                rows = scratch.rows;
             }
+            Floats columns[kSteps];
+            load_columns(rows, kSteps, kSteps, columns);
+            __m512i sum = _mm512_setzero_si512();
+            for (int k = 0; k < kSteps; ++k) {
+                const __m512i four = _mm512_castps_si512(columns[k]);
+                _mm512_storeu_si512(packed + from * kSteps + k * kLanes, four);
+                sum = _mm512_dpbusd_epi32(sum, four, _mm512_set1_epi8(1));
+            }
+            _mm512_storeu_si512(sums + from, _mm512_slli_epi32(sum, 7));
+        }
     }
 
     static SPLAT_METHOD void multiply(const Queries& queries, const NearestScratch& scratch, int vector,
