@@ -29,8 +29,8 @@ from commands import benchmark
 from rasterizing import contributing_pairs, raster_alone
 from tables import Row, console, print_table
 
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.runs.runner import versions
-from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig

@@ -38,7 +38,7 @@ from measure import (
     time_case,
 )
 
-from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs, Machine
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import Split, load_views

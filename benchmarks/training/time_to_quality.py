@@ -28,7 +28,7 @@ from measure import (
 )
 
 from splatpipe.pipeline.engine.config import parse_set, resolve
-from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.photos.pixels.dataset import load_views, split_views
 from splatpipe.pipeline.photos.pixels.images import load_colour, load_mask
 from splatpipe.pipeline.raster.threads import same_bits

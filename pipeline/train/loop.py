@@ -10,7 +10,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.output_file import write_file
-from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import read_model_area
 from splatpipe.pipeline.photos.pixels.dataset import View, load_split, load_views

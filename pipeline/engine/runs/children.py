@@ -16,13 +16,13 @@ from collections.abc import Callable, Sequence
 
 from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.python_module import python_module
+from splatpipe.pipeline.engine.runs.peak_memory import MAXRSS_BYTES, peak_memory_of
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 POLL_S = 0.2
 CHILDREN_MEMORY = "children_peak_memory_bytes"  # the metric with which a body reports its children's memory
 # Each child uses one core: thread pools of the numeric libraries would only compete with each other.
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-MAXRSS_BYTES = 1 if sys.platform == "darwin" else 1024  # the unit of ru_maxrss
 
 
 def die_with_parent(parent: int) -> None:
@@ -61,7 +61,7 @@ def run_children(commands: Sequence[Sequence[str]], poll: Callable[[], None], wh
         StageError: if one fails; the others are killed.
     """
     running: dict[int, subprocess.Popen[bytes]] = {}
-    peak = 0
+    peaks: dict[int, int] = {}
     try:
         for module, *arguments in commands:
             command = python_module(module, str(os.getpid()), *arguments)
@@ -70,11 +70,13 @@ def run_children(commands: Sequence[Sequence[str]], poll: Callable[[], None], wh
         while running:
             time.sleep(POLL_S)
             for pid in list(running):
+                peaks[pid] = peak_memory_of(pid) or peaks.get(pid, 0)
                 ended, status, usage = os.wait4(pid, os.WNOHANG)
                 if ended:
                     child = running.pop(pid)
                     child.returncode = os.waitstatus_to_exitcode(status)
-                    peak += usage.ru_maxrss * MAXRSS_BYTES
+                    # Linux counts in ru_maxrss what the parent had when it started the child.
+                    peaks[pid] = peaks[pid] or usage.ru_maxrss * MAXRSS_BYTES
                     _check(child.returncode, what)
             poll()
     finally:
@@ -82,7 +84,7 @@ def run_children(commands: Sequence[Sequence[str]], poll: Callable[[], None], wh
             child.kill()
         for child in running.values():
             child.wait()
-    return peak
+    return sum(peaks.values())
 
 
 def _check(code: int, what: str) -> None:

@@ -16,7 +16,8 @@ from splatpipe.pipeline.engine.errors import ERRORS, EXIT_TERMINATED, MachineErr
 from splatpipe.pipeline.engine.events import Event, Sink
 from splatpipe.pipeline.engine.files.output_file import appended_file
 from splatpipe.pipeline.engine.python_module import python_module
-from splatpipe.pipeline.engine.runs.worker import Task, peak_memory_of
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_of
+from splatpipe.pipeline.engine.runs.worker import Task
 from splatpipe.pipeline.engine.stage import JSON
 
 GRACE_S = 3.0  # training writes its checkpoint in less; Ctrl-C promises an end within five seconds

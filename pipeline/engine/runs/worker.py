@@ -7,11 +7,9 @@ dies with its parent, whatever kills the parent.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
-import resource
 import signal
 import sys
 import threading
@@ -34,6 +32,11 @@ from splatpipe.pipeline.engine.errors import (
 from splatpipe.pipeline.engine.events import Event, EventReporter
 from splatpipe.pipeline.engine.heap import imports_outside_gc, return_free_heap
 from splatpipe.pipeline.engine.runs.children import CHILDREN_MEMORY, die_with_parent
+from splatpipe.pipeline.engine.runs.peak_memory import (
+    peak_memory_bytes,
+    reset_peak_memory,
+    resident_memory_bytes,
+)
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Machine, Shard, StageConfig, load_body
 
 NO_MEMORY = (
@@ -109,12 +112,12 @@ def execute(task: Task, send: IO[str]) -> None:
             send.write(json.dumps(message) + "\n")
             send.flush()
 
-    children = 0  # peak memory of the body's own child processes, running side by side
+    with_children = 0  # peak memory of the body's child processes, with what it had itself while it waited for them
 
     def sink(event: Event) -> None:
-        nonlocal children
+        nonlocal with_children
         if event.kind == "metric" and event.data["name"] == CHILDREN_MEMORY:
-            children = max(children, int(event.data["value"]))
+            with_children = max(with_children, int(event.data["value"]) + resident_memory_bytes())
         send_message({"event": asdict(event)})
 
     started = _Usage.now()
@@ -135,7 +138,7 @@ def execute(task: Task, send: IO[str]) -> None:
         send_message({"failed": {"type": type(failure).__name__, "message": failure.message, "hint": failure.hint}})
     else:
         usage = started.until_now()
-        usage["peak_memory_bytes"] += children
+        usage["peak_memory_bytes"] = max(usage["peak_memory_bytes"], with_children)
         send_message({"done": {"summary": dict(summary), **usage}})
 
 
@@ -178,8 +181,7 @@ class _Usage:
     @staticmethod
     def now() -> _Usage:
         return_free_heap()  # freed by earlier stages: this one must not be charged for it
-        with contextlib.suppress(OSError):  # resets the kernel's record of this process's peak memory
-            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        reset_peak_memory()
         return _Usage(time.monotonic(), _cpu_seconds())
 
     def until_now(self) -> dict[str, float | int]:
@@ -194,23 +196,6 @@ def _cpu_seconds() -> float:
     """CPU seconds of this process and of its ended children."""
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
-
-
-def peak_memory_bytes() -> int:
-    """Peak resident memory of this process, bytes, since the stage began (where unsupported: since process start)."""
-    peak_bytes = peak_memory_of("self")
-    if peak_bytes is not None:
-        return peak_bytes
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
-
-
-def peak_memory_of(process: int | str) -> int | None:
-    """Peak resident memory of a process on this machine, bytes; None if the kernel does not report it."""
-    with contextlib.suppress(OSError, StopIteration, ValueError, UnicodeDecodeError):
-        lines = Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines()
-        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
-    return None
 
 
 def _requests(stream: IO[str]) -> Iterator[Task]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.dataset import View
 from splatpipe.pipeline.train.photos.stream import PhotoStream

@@ -432,7 +432,7 @@ import json, sys
 from pathlib import Path
 import tiny_scene
 from splatpipe.pipeline.engine.stage import Inputs, Machine
-from splatpipe.pipeline.engine.runs.worker import peak_memory_bytes
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.stages import train
 from splatpipe.pipeline.train.plan import plan
 from splatpipe.pipeline.train.sizing.measure import middle_of
