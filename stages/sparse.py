@@ -15,6 +15,7 @@ import pycolmap
 
 from splatpipe.pipeline.engine.files.json_file import read_json
 from splatpipe.pipeline.engine.files.output_file import write_file
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.photos.files.names import list_names
 from splatpipe.pipeline.photos.files.photo_list import load_photo_list
@@ -27,6 +28,7 @@ from splatpipe.pipeline.sfm.judging.judging import FEW_PAIRS, judge
 from splatpipe.pipeline.sfm.lenses.lens_model import stated_lenses
 from splatpipe.pipeline.sfm.lenses.lenses import calibrate, report_lenses
 from splatpipe.pipeline.sfm.model.sparse_model import write_model
+from splatpipe.pipeline.sfm.model.structure import read_structure
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import reconstruct
@@ -53,6 +55,7 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
     with tempfile.TemporaryDirectory(prefix="scratch-", dir=out, ignore_cleanup_errors=True) as scratch:
         capture = _capture(inputs, Path(scratch))
         found = run_ladder(capture, reconstruct(capture, config, report), config, report)
+        return_free_heap()
         reset_underdetermined_focals(found.model, found.verified, capture.cameras)
         film = load_film_times(inputs["ingest.photos"])
         shutter = None if film is None else _correct_shutter(found, film, config, report)
@@ -62,7 +65,9 @@ def run(config: SparseConfig, inputs: Inputs, out: Path, report: Reporter) -> Su
         model, lenses = calibrate(found.model, found.verified, stated, config.lens, config.seed)
         found = replace(found, model=model)
         tried = capture.tried | tried_pairs(found.database)
-    model = canonical(found.model, found.colours, _keypoint_counts(found.verified))
+    found = replace(found, model=canonical(found.model, found.verified, found.colours))
+    model = found.model
+    return_free_heap()
     write_model(model, out / "sparse" / "0")
     if film is not None and shutter is not None and shutter.readout.determined:
         save_film_shutter(film_shutter(model, film, shutter.readout.estimate_s), out / "sparse" / "0")
@@ -122,36 +127,29 @@ def _without_times(value: JSON) -> JSON:
     return [_without_times(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def _keypoint_counts(verified: ViewGraph) -> npt.NDArray[np.int64]:
-    return np.array([len(verified.keypoints[number]) for number in sorted(verified.keypoints)], np.int64)
-
-
-def canonical(model: Model, colours: npt.NDArray[np.uint8], counts: npt.NDArray[np.int64]) -> Model:
+def canonical(model: Model, verified: ViewGraph, colours: npt.NDArray[np.uint8]) -> Model:
     """Return the model normalised, with coloured points numbered in a fixed order.
 
     Args:
         model: Normalised in place.
+        verified: Its view graph.
         colours: (n, 3) RGB of all keypoints, image after image.
-        counts: Number of keypoints of each image, by image id starting at 1.
     """
     model.normalize()
-    starts = np.concatenate([[0], np.cumsum(counts)])
     result = Model()
     for number in sorted({model.images[image].camera_id for image in model.reg_image_ids()}):
         result.add_camera_with_trivial_rig(model.cameras[number])
     for number in sorted(model.reg_image_ids()):
         old = model.images[number]
-        places = np.array([point.xy for point in old.points2D], np.float64).reshape(-1, 2)
+        places = verified.keypoints[number].astype(np.float64)
         image = pycolmap.Image(old.name, places, old.camera_id, number)
         result.add_image_with_trivial_frame(image, old.cam_from_world())
-    tracks = [
-        (sorted((element.image_id, element.point2D_idx) for element in point.track.elements), point)
-        for point in model.points3D.values()
-    ]
-    for elements, point in sorted(tracks, key=lambda entry: entry[0]):
-        rows = [starts[image - 1] + keypoint for image, keypoint in elements]
+    structure = read_structure(model)
+    own = np.split(colours, np.cumsum([len(verified.keypoints[number]) for number in sorted(verified.keypoints)])[:-1])
+    for place, elements in zip(structure.points, structure.tracks, strict=True):
         track = pycolmap.Track([pycolmap.TrackElement(*element) for element in elements])
-        result.add_point3D(point.xyz, track, np.rint(colours[rows].mean(axis=0)).astype(np.uint8))
+        seen = np.array([own[image - 1][keypoint] for image, keypoint in elements])
+        result.add_point3D(place, track, np.rint(seen.mean(axis=0)).astype(np.uint8))
     result.update_point_3d_errors()
     return result
 

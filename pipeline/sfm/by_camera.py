@@ -120,7 +120,7 @@ def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
     for number in sorted(model.cameras):
         camera, total, count = model.cameras[number], 0.0, 0
         for image in (model.images[i] for i in sorted(model.reg_image_ids())):
-            seen = [point for point in image.points2D if point.has_point3D()] if image.camera_id == number else []
+            seen = image.get_observation_points2D() if image.camera_id == number else []
             if seen:
                 pose = np.asarray(image.cam_from_world().matrix(), np.float64)
                 places = np.array([model.points3D[point.point3D_id].xyz for point in seen])

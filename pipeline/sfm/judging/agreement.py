@@ -84,7 +84,7 @@ def compare(
     rays = rays_of(model, verified) if rays is None else rays
     poses = instead or {number: model.images[number].cam_from_world().matrix() for number in placed}
     points = {
-        number: _points(None if instead else model.images[number], len(verified.keypoints[number])) for number in placed
+        number: _points(None if instead else model.images[number], len(verified.keypoints[number])) for number in rays
     }
     pairs = sorted(verified.matches)
     rows = np.zeros((len(pairs), 4), np.int64)
@@ -163,9 +163,11 @@ def epipolar_errors(
 
 
 def rays_of(model: pycolmap.Reconstruction, verified: ViewGraph) -> dict[int, Rays]:
-    """Return the keypoints of each placed photo, undistorted, in units of the focal length."""
+    """Return the keypoints of each placed photo with matches, undistorted, in units of the focal length."""
     result = {}
-    for number in sorted(model.reg_image_ids()):
+    for number in sorted(
+        set(model.reg_image_ids()).intersection(number for pair in verified.matches for number in pair)
+    ):
         places = np.asarray(verified.keypoints[number], np.float64).reshape(-1, 2)
         result[number] = np.asarray(model.images[number].camera.cam_from_img(places), np.float64).reshape(-1, 2)
     return result
@@ -175,6 +177,6 @@ def _points(image: pycolmap.Image | None, count: int) -> Int64[np.ndarray, " n"]
     """Return the id of the point that each keypoint of a photo observes, -1 for none."""
     result = np.full(count, -1, np.int64)
     if image is not None:
-        for row in image.get_observation_point2D_idxs():
-            result[row] = image.point2D(row).point3D_id
+        seen = [point.point3D_id for point in image.get_observation_points2D()]
+        result[image.get_observation_point2D_idxs()] = seen
     return result

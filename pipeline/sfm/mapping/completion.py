@@ -47,11 +47,7 @@ def complete(
         place_left: Also place photos that need all matches; the ladder, with its own criteria, passes False.
         on_progress: Called from this thread before each photo and each round of adjustment.
     """
-    cache_options = pycolmap.DatabaseCacheOptions()
-    cache_options.min_num_matches = MIN_MATCHES
-    with pycolmap.Database.open(database) as opened:
-        cache = pycolmap.DatabaseCache.create(opened, cache_options)
-    mapper = pycolmap.IncrementalMapper(cache)
+    mapper = pycolmap.IncrementalMapper(read_correspondences(database))
     mapper.begin_reconstruction(model)
     triangulation, mapping = options.get_triangulation(), options.get_mapper()
     placed = sorted(model.reg_image_ids())
@@ -74,6 +70,14 @@ def complete(
     mapper.filter_frames(mapping)
     mapper.end_reconstruction(False)
     model.update_point_3d_errors()
+
+
+def read_correspondences(database: Path) -> pycolmap.DatabaseCache:
+    """Read what COLMAP's mapper works on: photos, keypoints and verified matches. It does not change them."""
+    options = pycolmap.DatabaseCacheOptions()
+    options.min_num_matches = MIN_MATCHES
+    with pycolmap.Database.open(database) as opened:
+        return pycolmap.DatabaseCache.create(opened, options)
 
 
 def _place_left(

@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 import pycolmap
 
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.parallel import run_in_thread
 from splatpipe.pipeline.sfm.mapping.completion import Progress, complete
 from splatpipe.pipeline.sfm.matching.reduction import best_keypoints, write_reduced
@@ -98,6 +99,7 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
             )
         for model in found.values():
             complete(model, database, settings, stop, on_progress=report_step)
+        return_free_heap()  # of this thread, which no other would use
         return largest_first(found)
 
     return run_in_thread(work, lambda: on_progress(*now), stop.cancel)

@@ -41,16 +41,23 @@ class Structure:
 
 
 def read_structure(model: pycolmap.Reconstruction) -> Structure:
-    """Return the points and tracks of a model."""
-    found = sorted(
-        (
-            (sorted((element.image_id, element.point2D_idx) for element in point.track.elements), point.xyz)
-            for point in model.points3D.values()
-        ),
-        key=lambda entry: entry[0],
-    )
-    points = np.array([place for _, place in found], np.float64).reshape(-1, 3)
-    return Structure(points, [track for track, _ in found])
+    """Return the points and tracks of a model.
+
+    Observations are read photo by photo: reading them point by point takes three times as long.
+    """
+    images = [model.images[number] for number in sorted(model.reg_image_ids())]
+    keypoints = [image.get_observation_point2D_idxs() for image in images]
+    ids = np.array([seen.point3D_id for image in images for seen in image.get_observation_points2D()], np.int64)
+    numbers, first, which = np.unique(ids, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # by the first observation, which no two tracks share: sorted by track
+    rows = np.argsort(order)[which]
+    listed = ((image.image_id, keypoint) for image, seen in zip(images, keypoints, strict=True) for keypoint in seen)
+    tracks: list[Track] = [[] for _ in numbers]
+    for row, element in zip(rows.tolist(), listed, strict=True):
+        tracks[row].append(element)
+    points = model.points3D
+    places = [points[number].xyz for number in numbers[order].tolist()]
+    return Structure(np.array(places, np.float64).reshape(-1, 3), tracks)
 
 
 def make_model(

@@ -53,7 +53,7 @@ def refine_words(
 ) -> Float32[np.ndarray, "words 128"]:
     """Move words to the rounded means of the descriptors that are nearest to them: rounds of k-means."""
     words = words.copy()
-    whole = sample.astype(np.int64)
+    whole = sample.astype(np.uint8)
     for _ in range(rounds):
         sums, counts = _sums(whole, assign(sample, words), len(words))
         filled = counts > 0
@@ -63,8 +63,10 @@ def refine_words(
 
 def assign(values: Float32[np.ndarray, "n 128"], words: Float32[np.ndarray, "words 128"]) -> Int64[np.ndarray, " n"]:
     """Return the nearest word of each descriptor, the first in case of ties."""
-    norms = (words * words).sum(axis=1)
-    return np.asarray((norms - 2.0 * (values @ words.T)).argmin(axis=1), np.int64)
+    distances = values @ words.T  # in place: there are 60,000 rows in a codebook's sample
+    distances *= -2.0
+    distances += (words * words).sum(axis=1)
+    return np.asarray(distances.argmin(axis=1), np.int64)
 
 
 def aggregate(
@@ -76,7 +78,7 @@ def aggregate(
     """
     values = photo.astype(np.float32)
     labels = assign(values, words)
-    sums, counts = _sums(values.astype(np.int64), labels, len(words))
+    sums, counts = _sums(photo, labels, len(words))
     residuals = (sums - counts[:, None] * words.astype(np.int64)).astype(np.float64)
     lengths = np.sqrt((residuals * residuals).sum(axis=1, keepdims=True))
     residuals /= np.maximum(lengths, 1.0)
@@ -85,14 +87,14 @@ def aggregate(
 
 
 def _sums(
-    values: Int64[np.ndarray, "n 128"], labels: Int64[np.ndarray, " n"], words: int
+    values: UInt8[np.ndarray, "n 128"], labels: Int64[np.ndarray, " n"], words: int
 ) -> tuple[Int64[np.ndarray, "words 128"], Int64[np.ndarray, " words"]]:
     counts = np.bincount(labels, minlength=words).astype(np.int64)
     totals = np.zeros((words, 128), np.int64)
     if len(values):
         filled = np.flatnonzero(counts)
         starts = np.concatenate([[0], np.cumsum(counts[filled])[:-1]])
-        totals[filled] = np.add.reduceat(values[np.argsort(labels, kind="stable")], starts, axis=0)
+        totals[filled] = np.add.reduceat(values[np.argsort(labels, kind="stable")], starts, axis=0, dtype=np.int64)
     return totals, counts
 
 

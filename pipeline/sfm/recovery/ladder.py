@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 import pycolmap
 
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.judging.agreement import compare
-from splatpipe.pipeline.sfm.mapping.completion import complete
+from splatpipe.pipeline.sfm.mapping.completion import complete, read_correspondences
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options
+from splatpipe.pipeline.sfm.matching.matching import look_alike
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 from splatpipe.pipeline.sfm.model.structure import (
     Structure,
@@ -30,7 +34,7 @@ from splatpipe.pipeline.sfm.model.structure import (
 )
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.pairing.pairs import Pair
+from splatpipe.pipeline.sfm.pairing.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.recovery.ladder_growth import MIN_OBSERVATIONS, ModelMapper, mean_error_px, observations
 from splatpipe.pipeline.sfm.recovery.ladder_joins import join
 from splatpipe.pipeline.sfm.recovery.ladder_keypoints import reextract
@@ -59,6 +63,24 @@ class LadderContext:
     capture: MappingInput
     options: MappingOptions
     report: Reporter
+    _correspondences: dict[Path, pycolmap.DatabaseCache] = field(default_factory=dict)  # of one database
+
+    @cached_property
+    def alike(self) -> Costs:
+        """Costs of pairs by the photos' content."""
+        return look_alike(self.capture.features, self.options.seed)
+
+    def mapper(self, database: Path, model: Model) -> ModelMapper:
+        """Return COLMAP's mapper on a model, which has the database's keypoints."""
+        if database not in self._correspondences:
+            self._correspondences.clear()
+            self._correspondences[database] = read_correspondences(database)
+        return ModelMapper(self._correspondences[database], model, self.options)
+
+    def free_memory(self) -> None:
+        """Return to the system what the steps so far needed, before a step that needs much."""
+        self._correspondences.clear()
+        return_free_heap()
 
     def report_progress(self, done: int, total: int, what: str) -> None:
         self.report.progress(done, total, what, "photos")
@@ -95,6 +117,7 @@ def run_ladder(capture: MappingInput, found: MappingResult, config: SparseConfig
             break
         started = time.process_time()
         before = found
+        work.free_memory()
         found = rung(work, found)
         cpu_s = time.process_time() - started
         gained = len(left) - len(unplaced(found))
@@ -109,6 +132,7 @@ def _completed(work: LadderContext, mapped: MappingResult, found: MappingResult)
     if not added:
         return found
     work.report_progress(len(added), len(added), "adjusting everything")
+    work.free_memory()
     before = _on(mapped, found)
     grown = _adjusted(work, before, found.model, added, everything=True)
     return mapped if grown is before else grown
@@ -134,9 +158,10 @@ def with_more_pairs(work: LadderContext, found: MappingResult) -> MappingResult:
     left = unplaced(found)
     work.report_progress(0, len(left), "looking for matches of the remaining photos")
     tried = work.capture.tried | tried_pairs(found.database)
-    pairs = choose_pairs(rank_partners(work.capture, found, left, work.options.seed), tried, PAIRS_A_PHOTO)
+    pairs = choose_pairs(rank_partners(work.capture, found, left, work.alike), tried, PAIRS_A_PHOTO)
     if not pairs:
         return found
+    work.free_memory()
     database = match_more(work.capture, found.database, pairs, work.options.seed, work.report)
     grown = register_until_stable(work, _on(found, replace(found, database=database, verified=read_verified(database))))
     return grown if len(unplaced(grown)) < len(left) else found
@@ -146,18 +171,19 @@ def with_stronger_keypoints(work: LadderContext, found: MappingResult) -> Mappin
     """Extract new keypoints in leftover photos and their likely partners, then place them."""
     left = unplaced(found)
     work.report_progress(0, len(left), "looking for matches of the remaining photos")
-    partners_by_photo = rank_partners(work.capture, found, left, work.options.seed)
+    partners_by_photo = rank_partners(work.capture, found, left, work.alike)
     photos = _choose_reextraction(
         found, partners_by_photo, max(MAX_STRONGER, int(MAX_STRONGER_SHARE * len(work.capture.photos)))
     )
     pairs = _pairs_among(found, partners_by_photo, photos)
     if not pairs:
         return found
+    work.free_memory()
     stronger = reextract(work.capture, found, photos, pairs, work.options.seed, work.report)
     verified = read_verified(stronger.database)
     wider = replace(found, database=stronger.database, verified=verified, colours=stronger.colours)
     wider = _on(found, wider)
-    growth = ModelMapper(wider.database, wider.model, work.options)
+    growth = work.mapper(wider.database, wider.model)
     growth.triangulate([number for number in photos if wider.model.exists_image(number)])
     growth.end()
     grown = register_until_stable(work, wider)
@@ -215,7 +241,7 @@ def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
             model = _extended(model, found.verified, structure, placements)
         else:
             model = pycolmap.Reconstruction(model)
-        growth = ModelMapper(found.database, model, work.options)
+        growth = work.mapper(found.database, model)
         growth.triangulate(sorted(placements))
         fresh = sorted(placements) or growth.place_by_pairs(left)
         growth.end()
@@ -277,7 +303,7 @@ def _joined(work: LadderContext, found: MappingResult) -> MappingResult:
         if model is None:
             remaining.append(other)
             continue
-        growth = ModelMapper(found.database, model, work.options)
+        growth = work.mapper(found.database, model)
         growth.triangulate(sorted(fresh))
         growth.end()
         grown = _adjusted(work, found, model, sorted(fresh))
@@ -309,7 +335,7 @@ def _adjusted(
         if everything:
             complete(model, found.database, incremental_options(work.options), pycolmap.CancellationToken(), False)
         else:
-            growth = ModelMapper(found.database, model, work.options)
+            growth = work.mapper(found.database, model)
             growth.adjust(kept)
             growth.end()
         bad = _not_held(found.verified, model, kept)
@@ -326,8 +352,9 @@ def _adjusted(
 
 def _not_held(verified: ViewGraph, model: Model, photos: Collection[int]) -> set[int]:
     """Return the photos that lost their points in the adjustment, or whose pose their matches contradict."""
-    placed = set(model.reg_image_ids())
-    agreement = compare(model, verified)
+    placed, asked = set(model.reg_image_ids()), set(photos)
+    matched = {pair: rows for pair, rows in verified.matches.items() if not asked.isdisjoint(pair)}
+    agreement = compare(model, replace(verified, matches=matched))
     matches, explained = dict.fromkeys(photos, 0), dict.fromkeys(photos, 0)
     partners, pairs = dict.fromkeys(photos, 0), dict.fromkeys(photos, 0)
     for row in np.flatnonzero(agreement.placed).tolist():

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from splatpipe.pipeline.sfm.mapping.completion import MIN_MATCHES, adjustment_options
+from splatpipe.pipeline.sfm.mapping.completion import adjustment_options
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 
@@ -16,18 +15,16 @@ MIN_OBSERVATIONS = 15  # points that an added photo must still observe after the
 
 
 class ModelMapper:
-    """COLMAP's mapper on an existing model; the database must contain the model's keypoints."""
+    """COLMAP's mapper on an existing model; the correspondences must be of the model's keypoints."""
 
-    def __init__(self, database: Path, model: pycolmap.Reconstruction, options: MappingOptions) -> None:
+    def __init__(
+        self, correspondences: pycolmap.DatabaseCache, model: pycolmap.Reconstruction, options: MappingOptions
+    ) -> None:
         pycolmap.set_random_seed(options.seed)
         self._options = incremental_options(options)
         self._triangulation = self._options.get_triangulation()
         self._triangulation.random_seed = options.seed
-        cache_options = pycolmap.DatabaseCacheOptions()
-        cache_options.min_num_matches = MIN_MATCHES
-        with pycolmap.Database.open(database) as opened:
-            self._cache = pycolmap.DatabaseCache.create(opened, cache_options)
-        self._mapper = pycolmap.IncrementalMapper(self._cache)
+        self._mapper = pycolmap.IncrementalMapper(correspondences)
         self._mapper.begin_reconstruction(model)
         self._model = model
 

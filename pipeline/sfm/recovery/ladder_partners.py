@@ -9,7 +9,6 @@ from itertools import zip_longest
 import numpy as np
 
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
-from splatpipe.pipeline.sfm.matching.matching import look_alike
 from splatpipe.pipeline.sfm.model.structure import read_structure
 from splatpipe.pipeline.sfm.pairing.layout import make_layout
 from splatpipe.pipeline.sfm.pairing.pairs import Costs, Pair, has_informative_positions, spatial_costs
@@ -21,14 +20,14 @@ PartnersByPhoto = dict[int, list[int]]
 MAX_PARTNERS = 100  # entries of a ranking that are kept; callers never need more
 
 
-def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[int], seed: int) -> PartnersByPhoto:
+def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[int], alike: Costs) -> PartnersByPhoto:
     """Interleave the rankings of all hints; candidates are placed photos and photos of other sub-models.
 
     Args:
-        capture: Positions and descriptors.
+        capture: Names and positions.
         found: The model and its view graph.
         left: Photos that are not placed.
-        seed: For the visual similarity.
+        alike: Costs of pairs by the photos' content.
     """
     placed = set(found.model.reg_image_ids())
     groups = [set(other.reg_image_ids()) for other in found.others]
@@ -36,7 +35,7 @@ def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[
     layout = make_layout(capture.photos.photos, capture.positions)
     if has_informative_positions(layout):
         hints.append(_by_costs(left, spatial_costs(layout)))
-    hints.append(_by_costs(left, look_alike(capture.features, seed)))
+    hints.append(_by_costs(left, alike))
     partners_by_photo: PartnersByPhoto = {}
     for photo in sorted(left):
         own = {member for group in groups if photo in group for member in group}
