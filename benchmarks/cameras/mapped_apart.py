@@ -11,7 +11,6 @@ to ``FOLDER/HOW``.
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from flight_scene import SyntheticFlight, choose_pairs, lens, make_flight
 from jaxtyping import Float64
 from tables import Row
 
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.photos.files.photo_list import PhotoList
 from splatpipe.pipeline.sfm.capture import MappingInput
@@ -178,7 +178,7 @@ def _pairs(count: int, seed: int) -> Row:
         "by_look_s": ended_s - between_s,
         "pairs_a_photo": 2.0 * by_position / count,
         "look_pairs_a_photo": 2.0 * by_look / count,
-        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "peak_bytes": peak_memory_bytes(),
     }
 
 
@@ -191,7 +191,7 @@ def main(how: str, database: Path, folder: Path, *made: str) -> None:
     models = _map(how, database, [int(number) for number in made])
     cpu_s = time.process_time() - began_s
     row: Row = {"how": how, "cpu_s": cpu_s, "placed": 0}
-    row["peak_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    row["peak_bytes"] = peak_memory_bytes()
     if models:
         row["placed"], row["points"] = models[0].num_reg_images(), models[0].num_points3D()
         row["error_px"] = models[0].compute_mean_reprojection_error()

@@ -14,7 +14,7 @@ import pycolmap
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
 from splatpipe.pipeline.sfm.judging.judging import Judgement, judge
-from splatpipe.pipeline.sfm.lenses.focal import MAX_UNOBSERVED_DEVIATION, UNOBSERVED, adjust_within, focal_sigmas
+from splatpipe.pipeline.sfm.lenses.focal import MAX_UNOBSERVED_DEVIATION, adjust_within, undetermined_sigma
 from splatpipe.pipeline.sfm.mapping.completion import complete
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options, map_global, map_incremental
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
@@ -332,8 +332,7 @@ def _focal_in_doubt(answer: MappingAttempt, priors: Mapping[int, pycolmap.Camera
         return False
     if answer.judgement is not None and any(reason.kind == "focal" for reason in answer.judgement.reasons):
         return True
-    sigmas = focal_sigmas(model)
-    return any(sigmas.get(number, math.inf) > UNOBSERVED for number in strayed)
+    return undetermined_sigma(model, strayed) > 0.0
 
 
 def _used(model: Model) -> list[int]:

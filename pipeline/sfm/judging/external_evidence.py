@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.geometry.robust import absolute_weights, robust_similarity
 from splatpipe.pipeline.sfm.judging.judging import Reason, is_trusted
-from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
+from splatpipe.pipeline.sfm.lenses.focal import undetermined_sigma
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.pairing.layout import EARTH_RADIUS_M
 
@@ -61,9 +61,8 @@ def _uncertain_focal_lengths(
     rough = [number for number in used if not is_trusted(cameras[number - 1])]
     if not rough:
         return []
-    sigmas = focal_sigmas(model)
-    worst = max(sigmas.get(number, math.inf) for number in rough)
-    if worst <= UNOBSERVED:
+    worst = undetermined_sigma(model, rough)
+    if not worst:
         return []
     known = all(verified.cameras[number].has_prior_focal_length for number in rough)
     accuracy = f"to {100.0 * worst:.0f} %" if math.isfinite(worst) else "not at all"

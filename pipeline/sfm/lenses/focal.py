@@ -9,7 +9,7 @@ width. That separates real captures well: 0.01 to 0.07 % with oblique photos, 3 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ PRINCIPAL_POINT_SIGMA = 0.01  # prior standard deviation of the principal point 
 MAX_DENSE = 60  # photos up to which the reduced system is solved densely
 MAX_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6
+ENOUGH_POINTS = 15_000  # of a model, which usually show that its focal lengths are determined
 EXTRA_SIGMA = 0.2  # prior standard deviation of a distortion coefficient: no lens has larger ones
 
 
@@ -59,6 +60,30 @@ def focal_sigmas(model: pycolmap.Reconstruction) -> dict[int, float]:
         adjuster.problem.add_residual_block(prior, None, [camera.params])
         kept += keep_shape(adjuster.problem, camera, principal_point=True)
     return posterior_focal_sigmas(copy, adjuster.problem)
+
+
+def undetermined_sigma(model: pycolmap.Reconstruction, cameras: Collection[int]) -> float:
+    """Return the largest relative standard deviation of some focal lengths; 0 if the photos determine all of them.
+
+    Some of the points are asked first: what they determine, all points determine, and a covariance of all takes more
+    memory than any other step of the stage.
+
+    Args:
+        model: In any frame; not modified.
+        cameras: COLMAP's ids.
+    """
+    points = sorted(model.points3D)
+    step = -(-len(points) // ENOUGH_POINTS)
+    fewer = pycolmap.Reconstruction(model)
+    for place, number in enumerate(points):
+        if place % step:
+            fewer.delete_point3D(number)
+    for each in (fewer, model) if step > 1 else (model,):
+        sigmas = focal_sigmas(each)
+        worst = max((sigmas.get(number, math.inf) for number in cameras), default=0.0)
+        if worst <= UNOBSERVED:
+            return 0.0
+    return worst
 
 
 def adjust_within(model: pycolmap.Reconstruction, focals: Mapping[int, float], share: float) -> None:

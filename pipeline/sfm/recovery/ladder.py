@@ -331,7 +331,7 @@ def _adjusted(
     old = sorted(found.model.reg_image_ids())
     before, error = sum(observations(found.model, old).values()), mean_error_px(found.model)
     kept = sorted(added)
-    while kept:
+    while True:
         if everything:
             complete(model, found.database, incremental_options(work.options), pycolmap.CancellationToken(), False)
         else:
@@ -342,10 +342,12 @@ def _adjusted(
         if not bad:
             break
         kept = [number for number in kept if number not in bad]
+        if not kept:
+            return found
         model = without(model, found.verified, bad)
     after, placed = sum(observations(model, old).values()), set(model.reg_image_ids())
     limit = max(WORSE_ERROR * error, error + WORSE_ERROR_PX)
-    if not kept or not placed.issuperset(old) or after < KEPT_OBSERVATIONS * before or mean_error_px(model) > limit:
+    if not placed.issuperset(old) or after < KEPT_OBSERVATIONS * before or mean_error_px(model) > limit:
         return found
     return replace(found, model=model)
 
