@@ -95,7 +95,7 @@ several levels include 1.8 for the levels, which are made once for all of them."
 WITH_PHOTOS = frozenset({"colmap", "transforms"})
 """Formats that include a folder of the undistorted photos, which they share."""
 
-MAPPED = {"root_photos": 347e6, "retried_at_once": 250e6}  # an upper bound: unplaced photos get further keypoints
+MAPPED = {"keypoints": 720, "retried_at_once": 250e6}  # an upper bound: unplaced photos get further keypoints
 EXPORTED = {"gaussians": 375, "format_bytes": 1, "exported_dataset": 0.598e6}
 STAGES = {
     "ingest": StageCosts(0.013, {"pixels": 1}, 0.8, 181e6, {}, {"photos": 508}),

@@ -17,7 +17,7 @@ from splatpipe.pipeline.sfm.matching.reduction import copy_photos
 from splatpipe.pipeline.sfm.pairing.pairs import Costs, Pair
 from splatpipe.pipeline.sfm.pairing.retrieval import PER_PHOTO, look_alike_costs
 
-PAIRS_A_PROCESS = 12  # at least: a process takes half a second to start
+PAIRS_A_PROCESS = 24  # at least: a process takes a CPU second to start, a pair 0.01 to 0.1
 PROCESS_BYTES = 400_000_000  # memory of a matching process at most: 0.16 to 0.27 GB on six captures
 MATCHER = "splatpipe.pipeline.sfm.matching.matching_process"
 

@@ -8,7 +8,7 @@ import pytest
 from lens_scene import HEIGHT, WIDTH, LensScene, make_lens, make_scene, orbit, strips
 
 from splatpipe.pipeline.engine.stage import JSON
-from splatpipe.pipeline.sfm.lenses import lens_trial
+from splatpipe.pipeline.sfm.lenses import focal, lens_trial
 from splatpipe.pipeline.sfm.lenses.focal import focal_sigmas
 from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens, apart_px, named_params, narrow, simplest, widen
 from splatpipe.pipeline.sfm.lenses.lenses import calibrate
@@ -179,6 +179,19 @@ def test_focal_length_is_as_well_known_in_a_wide_model(scene: LensScene, calibra
     for camera in found.cameras.values():
         widen(camera)
     assert focal_sigmas(found)[1] < 5.0 * simple
+
+
+def test_a_focal_length_is_asked_of_all_points_if_some_do_not_determine_it(
+    scene: LensScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flat = make_scene([make_lens("SIMPLE_RADIAL", SIMPLE)], strips(24, np.random.default_rng(1)), 1, flat=True).model
+    asked = []
+    monkeypatch.setattr(focal, "ENOUGH_POINTS", 300)
+    monkeypatch.setattr(focal, "focal_sigmas", lambda model: asked.append(model.num_points3D()) or focal_sigmas(model))
+    assert focal.undetermined_sigma(scene.model, [1]) == 0.0
+    assert len(asked) == 1 and asked[0] <= 300
+    assert focal.undetermined_sigma(flat, [1]) == focal_sigmas(flat)[1] > focal.UNOBSERVED
+    assert asked[1] <= 300 and asked[2] == flat.num_points3D()
 
 
 @pytest.mark.parametrize("name", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "RADIAL_FISHEYE"])

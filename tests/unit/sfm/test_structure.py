@@ -14,6 +14,7 @@ from splatpipe.pipeline.sfm.model.structure import (
     loosely_tied,
     make_model,
     poses_of,
+    read_structure,
     without,
 )
 from splatpipe.pipeline.sfm.recovery.ladder_growth import observations
@@ -42,6 +43,18 @@ def test_a_photo_whose_points_one_other_observes_is_loose(ring: Ring) -> None:
     assert loosely_tied(with_tracks(ring, [*sound, (4, 5), (4, 5)])) == {5}
     assert loosely_tied(with_tracks(ring, [*sound, (4, 5), (3, 5)])) == set()
     assert loosely_tied(with_tracks(ring, [*sound, (3, 4, 5)])) == set()
+
+
+def test_a_structure_is_read_as_it_was_written_sorted_by_track(ring: Ring) -> None:
+    tracks = [[(2, 7), (3, 0)], [(1, 5), (2, 3), (4, 1)], [(1, 4), (3, 2)], [(1, 0), (2, 4)]]
+    points = np.arange(12.0).reshape(4, 3)
+    model = model_of(ring, photos=[1, 2, 3, 4])
+    model = make_model(cameras_of(model).values(), poses_of(model), ring.verified, Structure(points, tracks))
+    found = read_structure(model)
+    assert found.tracks == sorted(tracks)
+    np.testing.assert_array_equal(found.points, points[[3, 2, 1, 0]])
+    empty = read_structure(pycolmap.Reconstruction())
+    assert empty.tracks == [] and empty.points.shape == (0, 3)
 
 
 def test_two_photos_alone_are_not_loose(ring: Ring) -> None:
