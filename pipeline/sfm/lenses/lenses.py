@@ -19,6 +19,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
+from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.sfm.lenses.held_out import of_photos, tracks_of
@@ -79,6 +80,7 @@ def calibrate(
         return model, _rows(model, model, states)
     tracks = of_photos(tracks_of(model, np.sort(held_out)), set(within.reg_image_ids()))
     trial = LensTrial(within, tracks, states, seed)
+    del within  # the trial's, which replaces it by better ones
     trial.take_stated(usable, held=how == "held")
     trial.free_steps()
     trial.try_fisheye()
@@ -131,6 +133,7 @@ def _finished(
     seed: int,
 ) -> pycolmap.Reconstruction:
     """Apply the calibrated lenses to the whole model: adjust, retriangulate, and adjust again."""
+    return_free_heap()  # of the trials
     result = pycolmap.Reconstruction(model)
     for number, camera in result.cameras.items():
         lens = lensed.cameras[number]

@@ -86,6 +86,9 @@ class LadderContext:
         self.report.progress(done, total, what, "photos")
 
 
+Rung: TypeAlias = Callable[[LadderContext, MappingResult], MappingResult]
+
+
 def run_ladder(capture: MappingInput, found: MappingResult, config: SparseConfig, report: Reporter) -> MappingResult:
     """Place the photos that mapping did not, where that is certain.
 
@@ -105,25 +108,27 @@ def run_ladder(capture: MappingInput, found: MappingResult, config: SparseConfig
     work = LadderContext(capture, options, report)
     if not config.ladder:
         return found
-    rungs: list[tuple[str, Callable[[LadderContext, MappingResult], MappingResult]]] = [
+    rungs: list[tuple[str, Rung]] = [
         ("registration", register_until_stable),
         ("more pairs", with_more_pairs),
         ("stronger keypoints", with_stronger_keypoints),
     ]
     mapped = found
     for name, rung in rungs:
-        left = unplaced(found)
-        if not left:
+        if not unplaced(found):
             break
-        started = time.process_time()
-        before = found
         work.free_memory()
-        found = rung(work, found)
-        cpu_s = time.process_time() - started
-        gained = len(left) - len(unplaced(found))
-        report.note(f"Ladder, {name}: {gained} of {len(left)} remaining photos placed.")
-        found = replace(found, rungs=(*before.rungs, {**_row(name, before, found), "cpu_s": round(cpu_s, 2)}))
+        found = _climb(work, found, name, rung)
     return _completed(work, mapped, found)
+
+
+def _climb(work: LadderContext, before: MappingResult, name: str, rung: Rung) -> MappingResult:
+    """Run one rung, and record what it did."""
+    started = time.process_time()
+    found = rung(work, before)
+    row = {**_row(name, before, found), "cpu_s": round(time.process_time() - started, 2)}
+    work.report.note(f"Ladder, {name}: {row['placed']} of {row['left']} remaining photos placed.")
+    return replace(found, rungs=(*before.rungs, row))
 
 
 def _completed(work: LadderContext, mapped: MappingResult, found: MappingResult) -> MappingResult:
@@ -133,7 +138,7 @@ def _completed(work: LadderContext, mapped: MappingResult, found: MappingResult)
         return found
     work.report_progress(len(added), len(added), "adjusting everything")
     work.free_memory()
-    before = _on(mapped, found)
+    before = replace(found, model=mapped.model)
     grown = _adjusted(work, before, found.model, added, everything=True)
     return mapped if grown is before else grown
 
