@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from splatpipe.pipeline.edit.options import SEEN_MEGAPIXELS
 from splatpipe.pipeline.film.options import MAX_FILM_MEGAPIXELS
 from splatpipe.pipeline.render.options import JUDGED_MEGAPIXELS
@@ -37,7 +35,6 @@ def sizes_of(size: CaptureSize, config: LineConfig, threads: int, costs: Costs, 
     return {
         "threads": float(threads),
         "photos": photos,
-        "root_photos": math.sqrt(photos),
         "crowd": max(1.0, photos / PHOTOS_OF_ONE_COST),
         "pixels": photos * size.megapixels,
         "pixels_at_once": threads * size.megapixels,
