@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -130,7 +129,5 @@ def add_gradients(parameters: Mapping[str, Tensor], gradients: Sequence[Tensor],
 
 def rate_columns(rate: Rate, parameter: Tensor) -> Float32[np.ndarray, " width"]:
     """The rate of every value of a row."""
-    row = parameter.shape[1:]
-    if not isinstance(rate, Tensor):
-        return np.full(math.prod(row), rate, np.float32)
-    return np.ascontiguousarray(np.broadcast_to(rate.numpy(), row).reshape(-1), np.float32)
+    each = rate.numpy() if isinstance(rate, Tensor) else rate
+    return np.full(parameter.shape[1:], each, np.float32).reshape(-1)

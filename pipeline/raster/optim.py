@@ -149,8 +149,7 @@ class Adam:
         if kernels is not None:
             kernels.adam(rows, options, self._skipped)
         else:
-            tensors = map(arrays, (rows.values, rows.gradients, rows.means, rows.squares, rows.rates))
-            self._skipped += _native.adam_step(*tensors, array_or_none(rows.visible), options)
+            self._skipped += step_on_cpu(rows, options)
 
     def _check(
         self, parameters: Mapping[str, Tensor], visible: Bool[Tensor, " n"] | None, stepped: Iterable[str]
@@ -228,6 +227,18 @@ class Adam:
     def _each(self, change: Callable[[Tensor], Tensor]) -> None:
         self.mean = {name: change(tensor) for name, tensor in self.mean.items()}
         self.square = {name: change(tensor) for name, tensor in self.square.items()}
+
+
+def step_on_cpu(rows: AdamRows, options: tuple[float, float, float, int]) -> int:
+    """Step rows with the native kernel, and return how many were skipped for their gradients.
+
+    Args:
+        rows: Tensors on the CPU.
+        options: Beta 1, beta 2, epsilon and the step, counted from 1.
+    """
+    values, gradients = arrays(rows.values), arrays(rows.gradients)
+    means, squares, rates = arrays(rows.means), arrays(rows.squares), arrays(rows.rates)
+    return _native.adam_step(values, gradients, means, squares, rates, array_or_none(rows.visible), options)
 
 
 @functools.lru_cache(maxsize=8)
