@@ -132,12 +132,14 @@ std::int64_t adam_rows(const AdamJob& job, std::int64_t from, std::int64_t to) {
 
 // The floats of a row, of a Gaussian's own parameters without a call.
 SPLAT_INLINE void copy_row(float* to, const float* from, int width) {
-    switch (width) {
-        case 1: to[0] = from[0]; break;
-        case 3: __builtin_memcpy(to, from, 3 * sizeof(float)); break;
-        case 4: __builtin_memcpy(to, from, 4 * sizeof(float)); break;
-        default: __builtin_memcpy(to, from, static_cast<std::size_t>(width) * sizeof(float));
-    }
+    if (width == 1)
+        to[0] = from[0];
+    else if (width == 3)
+        __builtin_memcpy(to, from, 3 * sizeof(float));
+    else if (width == 4)
+        __builtin_memcpy(to, from, 4 * sizeof(float));
+    else
+        __builtin_memcpy(to, from, static_cast<std::size_t>(width) * sizeof(float));
 }
 
 // Up to kAdamBlock scattered rows of one tensor: one by one if a row consists of whole vectors, otherwise through a

@@ -158,7 +158,8 @@ __attribute__((noinline)) void end_pixels(Light* light, int block, Mask which, i
     float* const at = light->transmittance + block * kLanes;
     const Floats zero = fill(0.0f), before = load(at), left = select(which, zero - before, before);
     store(at, left);
-    for (uint32_t lanes = bits(which); lanes; lanes &= lanes - 1) light->end[block * kLanes + __builtin_ctz(lanes)] = pair;
+    for (uint32_t lanes = bits(which); lanes; lanes &= lanes - 1)
+        light->end[block * kLanes + __builtin_ctz(lanes)] = pair;
     if (!any(less(zero, left))) light->alive &= ~(BlockMask{1} << block);
 }
 
