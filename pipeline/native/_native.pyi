@@ -1,10 +1,13 @@
-"""Kernels, built from the sources here. Arrays are C-contiguous CPU tensors of the given dtype, never copied."""
+"""Kernels, built from the sources here. Arrays are C-contiguous, of the given dtype, never copied."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from torch import Tensor
+
+Array = Tensor | np.ndarray[Any, Any]
+"""A tensor on the CPU, or its memory as an array, which is taken in a tenth of the time."""
 
 def set_threads(threads: int) -> None:
     """Set the size of the thread pool that all kernels share, including the caller; clamped to 1..256."""
@@ -32,10 +35,10 @@ class Frame:
     def __init__(self) -> None: ...
     def forward(
         self,
-        parameters: Sequence[Tensor],
+        parameters: Sequence[Array],
         camera: tuple[np.ndarray[Any, Any], tuple[int, int], tuple[float, float, float, float]],
         options: tuple[int, bool, float, float, tuple[float, float, float]],
-        outputs: tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor] | None, Tensor, Tensor],
+        outputs: tuple[Array, Array, Sequence[Array] | None, Array, Array],
         window: tuple[int, int, int, int] | None = None,
     ) -> None:
         """Render.
@@ -54,7 +57,7 @@ class Frame:
             ValueError: if shapes do not match.
         """
 
-    def blend_backward(self, gradients: Sequence[Tensor | None], magnitudes: bool = False) -> None:
+    def blend_backward(self, gradients: Sequence[Array | None], magnitudes: bool = False) -> None:
         """From the images of the last forward() to screen-space gradients.
 
         Args:
@@ -62,7 +65,7 @@ class Frame:
             magnitudes: For the gradients of the centres, sum absolute values over the pixels, separately in x and y.
         """
 
-    def project_backward(self, parameters: Sequence[Tensor], outputs: Sequence[Tensor], means2d: Tensor) -> None:
+    def project_backward(self, parameters: Sequence[Array], outputs: Sequence[Array], means2d: Array) -> None:
         """From there to the parameters; can be repeated.
 
         Args:
@@ -73,16 +76,16 @@ class Frame:
 
     def step(
         self,
-        parameters: Sequence[Tensor],
-        values: Sequence[Tensor],
-        means: Sequence[Tensor],
-        squares: Sequence[Tensor],
-        rates: Sequence[Tensor],
+        parameters: Sequence[Array],
+        values: Sequence[Array],
+        means: Sequence[Array],
+        squares: Sequence[Array],
+        rates: Sequence[Array],
         options: tuple[float, float, float, int],
         log_scale_limits: tuple[float, float],
         far: tuple[float, float, float, float] | None,
-        logit_gain: Tensor | None,
-        seen: tuple[Tensor, Tensor] | None,
+        logit_gain: Array | None,
+        seen: Sequence[Array] | None,
     ) -> int:
         """The same, fused with a step of Adam of the visible rows; no other rows are changed.
 
@@ -119,10 +122,10 @@ def free_frames() -> None:
     """Free the memory kept for later renders."""
 
 def project_activated(
-    gaussians: Sequence[Tensor],
+    gaussians: Sequence[Array],
     camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
     options: tuple[float, ...],
-    outputs: Sequence[Tensor | None],
+    outputs: Sequence[Array | None],
 ) -> None:
     """Project activated Gaussians to one view.
 
@@ -138,12 +141,12 @@ def project_activated(
     """
 
 def project_activated_backward(
-    gaussians: Sequence[Tensor],
+    gaussians: Sequence[Array],
     camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
     options: tuple[float, ...],
-    radii: Tensor,
-    gradients: Sequence[Tensor | None],
-    outputs: Sequence[Tensor],
+    radii: Array,
+    gradients: Sequence[Array | None],
+    outputs: Sequence[Array],
 ) -> None:
     """Add the gradients of means, quats and scales to `outputs`.
 
@@ -160,24 +163,24 @@ def project_activated_backward(
     """
 
 def sh_colours(
-    means: Tensor,
-    sh: Tensor,
-    radii: Tensor,
+    means: Array,
+    sh: Array,
+    radii: Array,
     camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
     degree: int,
-    colours: Tensor,
+    colours: Array,
 ) -> None:
     """Colours (n, 3) of sh (n, k, 3) from a view, clamped at 0; zeros where radii are. Writes `colours`."""
 
 def sh_colours_backward(
-    means: Tensor,
-    sh: Tensor,
-    radii: Tensor,
+    means: Array,
+    sh: Array,
+    radii: Array,
     camera: tuple[np.ndarray[Any, Any], tuple[float, ...], tuple[int, int], tuple[float, float, float, float]],
     degree: int,
-    gradients: Tensor,
-    by_means: Tensor,
-    by_sh: Tensor,
+    gradients: Array,
+    by_means: Array,
+    by_sh: Array,
 ) -> None:
     """Add the gradients by means and coefficients to the last two arguments, from those of the colours."""
 
@@ -191,11 +194,11 @@ class FeatureFrame:
     def __init__(self) -> None: ...
     def forward(
         self,
-        splats: Sequence[Tensor | None],
+        splats: Sequence[Array | None],
         size: tuple[int, int],
         alpha_max: float,
-        background: Tensor | None,
-        outputs: tuple[Tensor, Tensor],
+        background: Array | None,
+        outputs: tuple[Array, Array],
     ) -> None:
         """Blend; writes the images (h, w, d) and alpha (h, w). The background is (d,), or None for zeros.
 
@@ -206,9 +209,9 @@ class FeatureFrame:
 
     def backward(
         self,
-        splats: Sequence[Tensor | None],
-        gradients: Sequence[Tensor | None],
-        outputs: Sequence[Tensor | None],
+        splats: Sequence[Array | None],
+        gradients: Sequence[Array | None],
+        outputs: Sequence[Array | None],
     ) -> None:
         """Add gradients to `outputs`, from those of the images and alpha (None for zero).
 
@@ -224,11 +227,11 @@ class FeatureFrame:
         """
 
 def photo_loss(
-    render: Tensor,
-    photo: Tensor,
-    mask: Tensor | None,
+    render: Array,
+    photo: Array,
+    mask: Array | None,
     ssim_weight: float,
-    gradient: Tensor,
+    gradient: Array,
     inner: tuple[int, int, int, int] | None = None,
 ) -> float:
     """(1 - w) L1 + w (1 - SSIM) of two float32 (h, w, 3) images; its gradient for the render goes to `gradient`.
@@ -237,21 +240,19 @@ def photo_loss(
     all.
     """
 
-def affine_colour(affine: Tensor, picture: Tensor, out: Tensor) -> None:
+def affine_colour(affine: Array, picture: Array, out: Array) -> None:
     """Apply a (3, 4) affine map to the colours of a float32 (h, w, 3) image; writes `out`."""
 
-def affine_colour_backward(
-    affine: Tensor, picture: Tensor, upstream: Tensor, gradient: Tensor, by_affine: Tensor
-) -> None:
+def affine_colour_backward(affine: Array, picture: Array, upstream: Array, gradient: Array, by_affine: Array) -> None:
     """Gradients for the image and the map, written to the last two arguments, from the gradient for the result."""
 
 def adam_step(
-    values: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    means: Sequence[Tensor],
-    squares: Sequence[Tensor],
-    rates: Sequence[Tensor],
-    visible: Tensor | None,
+    values: Sequence[Array],
+    gradients: Sequence[Array],
+    means: Sequence[Array],
+    squares: Sequence[Array],
+    rates: Sequence[Array],
+    visible: Array | None,
     options: tuple[float, float, float, int],
 ) -> int:
     """One Adam step in place over float32 tensors with common rows; returns the number skipped for their gradients.
@@ -260,7 +261,7 @@ def adam_step(
     step, counted from 1.
     """
 
-def lay_over(sky: tuple[Any, ...], colour: Tensor, out: Tensor) -> None:
+def lay_over(sky: tuple[Any, ...], colour: Array, out: Array) -> None:
     """Replace the background of a float32 (h, w, 3) render; writes `out`.
 
     `sky`: alpha (h, w), nodes (rows, columns, 3); other nodes or None; uint8 (h, w) or None: zero where those are used;
@@ -270,7 +271,7 @@ def lay_over(sky: tuple[Any, ...], colour: Tensor, out: Tensor) -> None:
         ValueError: if sizes do not match or the nodes do not reach the last pixel.
     """
 
-def lay_over_backward(sky: tuple[Any, ...], upstream: Tensor, by_alpha: Tensor, by_nodes: Tensor | None) -> None:
+def lay_over_backward(sky: tuple[Any, ...], upstream: Array, by_alpha: Array, by_nodes: Array | None) -> None:
     """Gradients for the opacity and the nodes, from the gradient for the result."""
 
 def nearest_descriptors(

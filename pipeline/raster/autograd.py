@@ -23,6 +23,7 @@ from splatpipe.pipeline.raster.gradients import (
     rate_columns,
 )
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.native_arrays import array, array_or_none, arrays
 from splatpipe.pipeline.raster.native_camera import native_camera
 from splatpipe.pipeline.splat.model.gaussians import PARAMETERS, Gaussians
 
@@ -56,29 +57,27 @@ class UnfinishedRender:
 
     def step(self, step: FusedStep) -> None:
         """Finish the pass and step the visible rows of the parameters; the probe gets a sparse gradient."""
-        visible_count = self.frame.visible
-        seen = (
-            None
-            if self.probe is None
-            else (torch.empty(visible_count, dtype=torch.int64), torch.empty(visible_count, 2))
-        )
+        count = self.frame.visible
+        seen = None if self.probe is None else (torch.empty(count, dtype=torch.int64), torch.empty(count, 2))
         logits = step.values["opacity_logits"]
         skipped = self.frame.step(
-            self.parameters,
-            [step.values[name].detach() for name in PARAMETERS],
-            [step.means[name] for name in PARAMETERS],
-            [step.squares[name] for name in PARAMETERS],
-            [rate_columns(step.rates[name], step.values[name]) for name in PARAMETERS],
+            arrays(self.parameters),
+            arrays(step.values[name] for name in PARAMETERS),
+            arrays(step.means[name] for name in PARAMETERS),
+            arrays(step.squares[name] for name in PARAMETERS),
+            tuple(rate_columns(step.rates[name], step.values[name]) for name in PARAMETERS),
             step.options,
             step.log_scale_limits,
             None if step.far is None else (*step.far.centre, step.far.unit),
-            None if self.logits_are_leaf else logits.grad,
-            seen,
+            None if self.logits_are_leaf else array_or_none(logits.grad),
+            None if seen is None else arrays(seen),
         )
-        step.skipped.add_(skipped)
+        if skipped:
+            step.skipped.add_(skipped)
         if self.probe is not None and seen is not None:
-            stepped = int(self.visible[: len(logits)].sum())
-            rows, means2d = (each[:stepped] for each in seen)
+            if len(logits) < len(self.visible):
+                count = int(self.visible[: len(logits)].sum())
+            rows, means2d = (each[:count] for each in seen)
             shape = self.probe.shape
             self.probe.grad = torch.sparse_coo_tensor(
                 rows[None], means2d, shape, is_coalesced=True, check_invariants=False
@@ -134,10 +133,10 @@ class _Rasterize(torch.autograd.Function):
         frame = _native.Frame()
         try:
             frame.forward(
-                parameters,
+                arrays(parameters),
                 native_camera(camera),
                 (options.sh_degree, options.antialias, options.near, options.depth_origin, options.background),
-                (colour, alpha, depths, radii, visible),
+                (array(colour), array(alpha), depths and arrays(depths), array(radii), array(visible)),
                 None if part is None else (part.left, part.top, part.whole_width, part.whole_height),
             )
         except (_native.TooManyPairs, MemoryError) as error:
@@ -166,7 +165,7 @@ class _Rasterize(torch.autograd.Function):
         *_: None,
     ) -> tuple[Tensor | None, ...]:
         upstream = (colour, alpha, depth_sum, depth_square_sum)
-        pictures = tuple(None if grad is None else grad.contiguous() for grad in upstream)
+        pictures = tuple(None if grad is None else array(grad.contiguous()) for grad in upstream)
         parameters = ctx.saved_tensors  # raises if one was changed since
         wanted = ctx.needs_input_grad[3:]
         try:
@@ -189,7 +188,7 @@ def _project_backward(
     """From a frame's screen-space gradients to those of its parameters and of the projected centres."""
     gradients = tuple(torch.empty_like(tensor) for tensor in parameters)
     means2d = torch.empty(len(parameters[0]), 2)
-    frame.project_backward(parameters, gradients, means2d)
+    frame.project_backward(arrays(parameters), arrays(gradients), array(means2d))
     return gradients, means2d
 
 

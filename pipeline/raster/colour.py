@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.native_arrays import arrays
 
 
 def affine_colour(picture: Float[Tensor, "h w 3"], affine: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
@@ -36,7 +37,7 @@ class _AffineColour(torch.autograd.Function):
         if kernels is not None:
             return kernels.affine_colour(affine, picture)
         out = torch.empty_like(picture)
-        _native.affine_colour(affine, picture, out)
+        _native.affine_colour(*arrays((affine, picture, out)))
         return out
 
     @staticmethod
@@ -45,5 +46,5 @@ class _AffineColour(torch.autograd.Function):
         if ctx.kernels is not None:
             return None, *ctx.kernels.affine_colour_backward(affine, picture, upstream[0].contiguous())
         gradient, by_affine = torch.empty_like(picture), torch.empty_like(affine)
-        _native.affine_colour_backward(affine, picture, upstream[0].contiguous(), gradient, by_affine)
+        _native.affine_colour_backward(*arrays((affine, picture, upstream[0].contiguous(), gradient, by_affine)))
         return None, gradient, by_affine

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda.cuda import AdamRows, kernels_of
-from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.optim import step_on_cpu
 
 _MAX_WIDTH = 64
 """Values of a row that the kernels take."""
@@ -120,7 +120,7 @@ class FusedAdam(torch.optim.Optimizer):
         if kernels is not None:
             kernels.adam(rows, options, torch.zeros((), dtype=torch.int64, device=parameter.device))
         else:
-            _native.adam_step(rows.values, rows.gradients, rows.means, rows.squares, rows.rates, rows.visible, options)
+            step_on_cpu(rows, options)
 
 
 def _rows(parameter: Tensor, moments: tuple[Tensor, Tensor], rate: float, visible: Tensor | None) -> AdamRows:

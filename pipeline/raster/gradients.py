@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import torch
-from jaxtyping import Bool, Float, Int64
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.raster.step_lengths import FarSteps
@@ -128,8 +127,7 @@ def add_gradients(parameters: Mapping[str, Tensor], gradients: Sequence[Tensor],
             parameters[name].grad = gradient if before is None else before + gradient
 
 
-def rate_columns(rate: Rate, parameter: Tensor) -> Float[Tensor, " width"]:
+def rate_columns(rate: Rate, parameter: Tensor) -> Float32[np.ndarray, " width"]:
     """The rate of every value of a row."""
-    if not isinstance(rate, Tensor):
-        return torch.full((math.prod(parameter.shape[1:]),), rate, dtype=torch.float32)
-    return torch.as_tensor(rate, dtype=torch.float32).expand(parameter.shape[1:]).reshape(-1).contiguous()
+    each = rate.numpy() if isinstance(rate, Tensor) else rate
+    return np.full(parameter.shape[1:], each, np.float32).reshape(-1)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.native_arrays import array, array_or_none
 from splatpipe.pipeline.splat.quality.metrics import SSIM_WINDOW
 
 Rectangle = tuple[int, int, int, int]
@@ -110,7 +111,8 @@ class _PhotoLoss(torch.autograd.Function):
             loss, gradient = kernels.photo_loss(seen, compared, counts, ssim_weight, inner)
         else:
             gradient = torch.empty_like(seen)
-            loss = render.new_tensor(_native.photo_loss(seen, compared, counts, ssim_weight, gradient, inner))
+            images = (array(seen), array(compared), array_or_none(counts))
+            loss = render.new_tensor(_native.photo_loss(*images, ssim_weight, array(gradient), inner))
         ctx.save_for_backward(gradient)
         return loss
 

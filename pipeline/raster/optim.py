@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
@@ -14,6 +15,7 @@ from splatpipe.pipeline.raster.cuda.cuda import AdamRows, kernels_of
 from splatpipe.pipeline.raster.device import take_rows
 from splatpipe.pipeline.raster.gradients import FusedStep, GradientBuffers, Rate, rate_columns
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.native_arrays import array_or_none, arrays
 from splatpipe.pipeline.raster.step_lengths import FarSteps
 
 _MEAN = "mean."
@@ -139,7 +141,7 @@ class Adam:
             [_gradient(parameters[name]) for name in names],
             [self.mean[name] for name in names],
             [self.square[name] for name in names],
-            [rate_columns(rates[name], parameters[name]) for name in names],
+            [torch.from_numpy(rate_columns(rates[name], parameters[name])) for name in names],
             None if visible is None else visible.contiguous().view(torch.uint8),
         )
         options = (*self.betas, self.epsilon, self.step_count)
@@ -147,8 +149,7 @@ class Adam:
         if kernels is not None:
             kernels.adam(rows, options, self._skipped)
         else:
-            moments = (rows.means, rows.squares)
-            self._skipped += _native.adam_step(rows.values, rows.gradients, *moments, rows.rates, rows.visible, options)
+            self._skipped += step_on_cpu(rows, options)
 
     def _check(
         self, parameters: Mapping[str, Tensor], visible: Bool[Tensor, " n"] | None, stepped: Iterable[str]
@@ -158,13 +159,14 @@ class Adam:
         Raises:
             ValueError: as in ``step``.
         """
-        taken = self.device.type == "cpu" or kernels_of(self.device) is not None
+        device = self.device
+        taken = device.type == "cpu" or kernels_of(device) is not None
         for name in stepped:
             tensor = parameters[name]
             if tensor.shape != self.mean[name].shape:
                 raise ValueError(f"{name} is {tuple(tensor.shape)}, its moments {tuple(self.mean[name].shape)}")
-            if tensor.dtype != torch.float32 or tensor.device != self.device or not tensor.is_contiguous() or not taken:
-                raise ValueError(f"{name} is not a contiguous float32 tensor that kernels on {self.device} step")
+            if tensor.dtype != torch.float32 or tensor.device != device or not tensor.is_contiguous() or not taken:
+                raise ValueError(f"{name} is not a contiguous float32 tensor that kernels on {device} step")
         if visible is not None and (visible.shape != (len(self),) or visible.dtype != torch.bool):
             raise ValueError(
                 f"visible is {tuple(visible.shape)} of {visible.dtype}, not a bool for each of {len(self)}"
@@ -227,8 +229,21 @@ class Adam:
         self.square = {name: change(tensor) for name, tensor in self.square.items()}
 
 
+def step_on_cpu(rows: AdamRows, options: tuple[float, float, float, int]) -> int:
+    """Step rows with the native kernel, and return how many were skipped for their gradients.
+
+    Args:
+        rows: Tensors on the CPU.
+        options: Beta 1, beta 2, epsilon and the step, counted from 1.
+    """
+    values, gradients = arrays(rows.values), arrays(rows.gradients)
+    means, squares, rates = arrays(rows.means), arrays(rows.squares), arrays(rows.rates)
+    return _native.adam_step(values, gradients, means, squares, rates, array_or_none(rows.visible), options)
+
+
+@functools.lru_cache(maxsize=8)
 def sh_rates(coefficients: int, constant: float, higher: float) -> Float[Tensor, "k 1"]:
-    """Learning rates of an (n, k, 3) tensor of spherical harmonics.
+    """Learning rates of an (n, k, 3) tensor of spherical harmonics; not to be changed, for they are kept.
 
     Args:
         coefficients: k.
@@ -251,8 +266,9 @@ def _with_gradients(parameters: Mapping[str, Tensor]) -> list[str]:
 def _is_fused(rates: Mapping[str, Rate], limits: Limits | None) -> bool:
     """Whether the fused step supports these: one rate per parameter, two for SH, limits for scales only."""
     plain = all(not isinstance(rate, Tensor) or rate.numel() == 1 for name, rate in rates.items() if name != "sh")
-    sh = torch.as_tensor(rates.get("sh", 0.0)).reshape(-1)
-    return plain and bool((sh[1:] == sh[-1]).all()) and (limits or {}).keys() <= {"log_scales"}
+    sh = rates.get("sh", 0.0)
+    higher = sh.flatten()[1:].tolist() if isinstance(sh, Tensor) else []
+    return plain and len(set(higher)) <= 1 and (limits or {}).keys() <= {"log_scales"}
 
 
 def _gradient(parameter: Tensor) -> Tensor:

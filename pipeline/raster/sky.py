@@ -13,6 +13,7 @@ from torch import Tensor
 from splatpipe.pipeline.raster.cuda.cuda import CudaKernels, kernels_of
 from splatpipe.pipeline.raster.cuda.cuda_api import SplatSky
 from splatpipe.pipeline.raster.isa import _native
+from splatpipe.pipeline.raster.native_arrays import array, array_or_none, arrays
 from splatpipe.pipeline.splat.sky.panorama import STEP_PX, between_nodes, composite_over
 
 
@@ -88,7 +89,7 @@ class _SkyComposite(torch.autograd.Function):
         ctx.save_for_backward(colour, alpha, nodes)
         out = torch.empty_like(colour)
         if kernels is None:
-            _native.lay_over(_sky(alpha, nodes, behind), colour, out)
+            _native.lay_over(_sky(alpha, nodes, behind), *arrays((colour, out)))
             return out
         sky, _kept = _cuda_sky(kernels, colour, alpha, nodes, behind)
         kernels.call("splat_sky", ctypes.byref(sky), kernels.at(out))
@@ -101,7 +102,8 @@ class _SkyComposite(torch.autograd.Function):
         by_alpha = torch.empty_like(alpha)
         by_nodes = torch.empty_like(nodes) if behind.mask is not None and ctx.needs_input_grad[3] else None
         if kernels is None:
-            _native.lay_over_backward(_sky(alpha, nodes, behind), given, by_alpha, by_nodes)
+            into = (array(by_alpha), array_or_none(by_nodes))
+            _native.lay_over_backward(_sky(alpha, nodes, behind), array(given), *into)
         else:
             sky, _kept = _cuda_sky(kernels, colour, alpha, nodes, behind)
             gradients = (kernels.at(by_alpha), kernels.at(by_nodes))
@@ -120,7 +122,8 @@ def _contiguous(behind: SkyLayer) -> tuple[Tensor | None, Tensor | None, Tensor 
 
 def _sky(alpha: Tensor, nodes: Tensor, behind: SkyLayer) -> tuple[Any, ...]:
     """The argument of the CPU kernels."""
-    return alpha, nodes, *_contiguous(behind), behind.step, behind.background
+    masks = (array_or_none(each) for each in _contiguous(behind))
+    return *arrays((alpha, nodes)), *masks, behind.step, behind.background
 
 
 def _cuda_sky(

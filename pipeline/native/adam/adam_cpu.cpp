@@ -130,6 +130,18 @@ std::int64_t adam_rows(const AdamJob& job, std::int64_t from, std::int64_t to) {
     return skipped;
 }
 
+// The floats of a row, of a Gaussian's own parameters without a call.
+SPLAT_INLINE void copy_row(float* to, const float* from, int width) {
+    if (width == 1)
+        to[0] = from[0];
+    else if (width == 3)
+        __builtin_memcpy(to, from, 3 * sizeof(float));
+    else if (width == 4)
+        __builtin_memcpy(to, from, 4 * sizeof(float));
+    else
+        __builtin_memcpy(to, from, static_cast<std::size_t>(width) * sizeof(float));
+}
+
 // Up to kAdamBlock scattered rows of one tensor: one by one if a row consists of whole vectors, otherwise through a
 // copy of all.
 void step_apart(const AdamTensor& tensor, const float* gradient, const std::int32_t* rows, int count,
@@ -147,21 +159,18 @@ void step_apart(const AdamTensor& tensor, const float* gradient, const std::int3
     }
     constexpr int kRoom = kAdamBlock * kAdamWidth;
     float values[kRoom], mean[kRoom], square[kRoom];
-    const auto copy = [width](float* to, const float* from) {
-        __builtin_memcpy(to, from, static_cast<std::size_t>(width) * sizeof(float));
-    };
     for (int i = 0; i < count; ++i) {
         const std::int64_t at = std::int64_t{rows[i] < 0 ? 0 : rows[i]} * width;
-        copy(values + i * width, tensor.values + at), copy(mean + i * width, tensor.mean + at);
-        copy(square + i * width, tensor.square + at);
+        copy_row(values + i * width, tensor.values + at, width), copy_row(mean + i * width, tensor.mean + at, width);
+        copy_row(square + i * width, tensor.square + at, width);
     }
     const Block block{values, mean, square, gradient, tensor.rates};
     for (int j = 0; j < count * width; j += kLanes) step_lanes(block, j, c, nullptr);
     for (int i = 0; i < count; ++i) {
         if (!(stepping >> i & 1u)) continue;
         const std::int64_t at = std::int64_t{rows[i]} * width;
-        copy(tensor.values + at, values + i * width), copy(tensor.mean + at, mean + i * width);
-        copy(tensor.square + at, square + i * width);
+        copy_row(tensor.values + at, values + i * width, width), copy_row(tensor.mean + at, mean + i * width, width);
+        copy_row(tensor.square + at, square + i * width, width);
     }
 }
 
@@ -169,10 +178,12 @@ void step_apart(const AdamTensor& tensor, const float* gradient, const std::int3
 unsigned stepping_apart(const AdamJob& job, const std::int32_t* rows, int count, const float* const* gradients,
                         std::int64_t* skipped) {
     unsigned stepping = 0;
+    bool all = true;  // their gradients lie side by side
+    for (int t = 0; t < job.tensor_count; ++t) all = all && all_finite(gradients[t], count * job.tensors[t].width);
     for (int i = 0; i < count; ++i) {
         if (rows[i] < 0) continue;
         bool finite = true;
-        for (int t = 0; t < job.tensor_count; ++t) {
+        for (int t = 0; t < job.tensor_count && !all; ++t) {
             const int width = job.tensors[t].width;
             finite = finite && all_finite(gradients[t] + i * width, width);
         }

@@ -15,10 +15,11 @@ AdamTables::AdamTables(const std::vector<AdamRows>& tensors, std::int64_t rows, 
         const std::size_t width = static_cast<std::size_t>(tensor.width), n = kAdamBlock * width;
         rates_.emplace_back(n);
         row_of_.emplace_back(n);
-        for (std::size_t i = 0; i < n; ++i) {
-            rates_.back()[i] = static_cast<float>(corrections.rate * tensor.rates[i % width]);
-            row_of_.back()[i] = static_cast<std::int32_t>(i / width);
-        }
+        for (std::size_t i = 0, row = 0; row < kAdamBlock; ++row)
+            for (std::size_t column = 0; column < width; ++column, ++i) {
+                rates_.back()[i] = static_cast<float>(corrections.rate * tensor.rates[column]);
+                row_of_.back()[i] = static_cast<std::int32_t>(row);
+            }
         job_.tensors[job_.tensor_count++] = {tensor.values,        tensor.gradient,       tensor.mean, tensor.square,
                                              rates_.back().data(), row_of_.back().data(), tensor.width};
     }

@@ -201,17 +201,50 @@ SPLAT_INLINE void transpose(Floats* v) {
         v[4 + j] = _mm256_permute2f128_ps(quad[j], quad[4 + j], 0x31);
     }
 }
+// Gathers are slow on many CPUs with AVX2, so colours and rows of four go through shuffles.
+SPLAT_INLINE Floats load_halves(const float* lower, const float* upper) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(lower)), _mm_loadu_ps(upper), 1);
+}
+SPLAT_INLINE void store_halves(float* lower, float* upper, Floats v) {
+    _mm_storeu_ps(lower, _mm256_castps256_ps128(v));
+    _mm_storeu_ps(upper, _mm256_extractf128_ps(v, 1));
+}
+// Each half of a vector has four pixels' colours, in three pieces of four floats.
+SPLAT_INLINE void store_rgb(float* p, Floats red, Floats green, Floats blue) {
+    const Floats rg = _mm256_shuffle_ps(red, green, 0x88), gb = _mm256_shuffle_ps(green, blue, 0xdd);
+    const Floats br = _mm256_shuffle_ps(blue, red, 0xd8);
+    store_halves(p, p + 12, _mm256_shuffle_ps(rg, br, 0x88));
+    store_halves(p + 4, p + 16, _mm256_shuffle_ps(gb, rg, 0xd8));
+    store_halves(p + 8, p + 20, _mm256_shuffle_ps(br, gb, 0xdd));
+}
+SPLAT_INLINE void load_rgb(const float* p, Floats* red, Floats* green, Floats* blue) {
+    const Floats v0 = load_halves(p, p + 12), v1 = load_halves(p + 4, p + 16), v2 = load_halves(p + 8, p + 20);
+    const Floats rg = _mm256_shuffle_ps(v1, v2, 0x9e), gb = _mm256_shuffle_ps(v0, v1, 0x49);
+    *red = _mm256_shuffle_ps(v0, rg, 0x8c);
+    *green = _mm256_shuffle_ps(gb, rg, 0xd8);
+    *blue = _mm256_shuffle_ps(gb, v2, 0xcd);
+}
+// A 4 x 4 matrix in each half.
+SPLAT_INLINE void transpose_halves(Floats* v) {
+    const Floats a = _mm256_unpacklo_ps(v[0], v[1]), b = _mm256_unpackhi_ps(v[0], v[1]);
+    const Floats c = _mm256_unpacklo_ps(v[2], v[3]), d = _mm256_unpackhi_ps(v[2], v[3]);
+    v[0] = _mm256_shuffle_ps(a, c, 0x44), v[1] = _mm256_shuffle_ps(a, c, 0xee);
+    v[2] = _mm256_shuffle_ps(b, d, 0x44), v[3] = _mm256_shuffle_ps(b, d, 0xee);
+}
+SPLAT_INLINE void load_fours(const float* p, Floats* columns) {
+    for (int i = 0; i < 4; ++i) columns[i] = load_halves(p + 4 * i, p + 4 * i + 16);
+    transpose_halves(columns);
+}
+SPLAT_INLINE void store_fours(float* p, Floats* columns) {
+    transpose_halves(columns);
+    for (int i = 0; i < 4; ++i) store_halves(p + 4 * i, p + 4 * i + 16, columns[i]);
+}
 SPLAT_INLINE Mask below(int32_t value, const int32_t* p) {
     const __m256i loaded = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
     return _mm256_castsi256_ps(_mm256_cmpgt_epi32(loaded, _mm256_set1_epi32(value)));
 }
-SPLAT_INLINE Floats load_pieces(const float* p, int step) {
-    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + step), 1);
-}
-SPLAT_INLINE void store_pieces(float* p, int step, Floats v) {
-    _mm_storeu_ps(p, _mm256_castps256_ps128(v));
-    _mm_storeu_ps(p + step, _mm256_extractf128_ps(v, 1));
-}
+SPLAT_INLINE Floats load_pieces(const float* p, int step) { return load_halves(p, p + step); }
+SPLAT_INLINE void store_pieces(float* p, int step, Floats v) { store_halves(p, p + step, v); }
 SPLAT_INLINE Floats inverse(Floats x) { return fill(1.0f) / x; }  // rcpps differs between makes of CPU
 SPLAT_INLINE void sum_lanes(Floats a, Floats b, Floats c, Floats d, float* out) {
     const Floats abcd = _mm256_hadd_ps(_mm256_hadd_ps(a, b), _mm256_hadd_ps(c, d));
@@ -300,7 +333,7 @@ SPLAT_INLINE bool any(Mask m) { return bits(m) != 0; }
 
 #endif
 
-#if !SPLAT_ISA_AVX512
+#if !SPLAT_ISA_AVX512 && !SPLAT_ISA_AVX2
 SPLAT_INLINE void store_rgb(float* p, Floats red, Floats green, Floats blue) {
     float r[kLanes], g[kLanes], b[kLanes];
     store(r, red), store(g, green), store(b, blue);
@@ -333,6 +366,12 @@ SPLAT_INLINE void store_columns(float* rows, int width, Floats* columns) {
         for (int i = 0; i < kLanes; ++i) rows[i * width + column] = lanes[i];
     }
 }
+
+#if !SPLAT_ISA_AVX2
+// kLanes rows of four floats.
+SPLAT_INLINE void load_fours(const float* p, Floats* columns) { load_columns(p, 4, 4, columns); }
+SPLAT_INLINE void store_fours(float* p, Floats* columns) { store_columns(p, 4, columns); }
+#endif
 
 using Ints = int32_t __attribute__((vector_size(kLanes * 4)));
 

@@ -60,7 +60,7 @@ SPLAT_INLINE void blend_blocks(const Walk& walk, const TileSplat& splat, const S
         if (kSlanted) add_to(walk.planes + (channels - 1) * kTilePixels + at, weight[k], slant_of(splat, s, block[k]));
         store(light->transmittance + at, select(blended[k], after[k], before[k]));
         const Mask ended = without(met[k], blended[k]);
-        if (__builtin_expect(any(ended), 0)) end_pixels(light, block[k], bits(ended), pair);
+        if (__builtin_expect(any(ended), 0)) end_pixels(light, block[k], ended, pair);
     }
 }
 

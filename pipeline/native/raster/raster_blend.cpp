@@ -56,7 +56,7 @@ SPLAT_INLINE void blend_blocks(const TileSplat& splat, const Splat& s, BlockMask
             }
         }
         const Mask ended = without(met[k], blended[k]);
-        if (__builtin_expect(any(ended), 0)) end_pixels(canvas, block[k], bits(ended), pair);
+        if (__builtin_expect(any(ended), 0)) end_pixels(canvas, block[k], ended, pair);
     }
 }
 

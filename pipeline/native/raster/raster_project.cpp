@@ -76,8 +76,8 @@ SPLAT_INLINE Lanes load_lanes(const Rows& rows) {
     Lanes lanes;
     load_rgb(rows.means, &lanes.mean.x, &lanes.mean.y, &lanes.mean.z);
     load_rgb(rows.log_scales, &lanes.log_scale.x, &lanes.log_scale.y, &lanes.log_scale.z);
-    Floats quats[kLanes];
-    load_columns(rows.quats, 4, 4, quats);
+    Floats quats[4];
+    load_fours(rows.quats, quats);
     lanes.qw = quats[0], lanes.qx = quats[1], lanes.qy = quats[2], lanes.qz = quats[3];
     lanes.logit = load(rows.opacity_logits);
     return lanes;
@@ -234,8 +234,8 @@ SPLAT_INLINE void put_rows(const LanesGradient& d, Floats* sh, int sh_row, Mask 
     const auto seen = [&](Floats v) { return only(touched, v); };  // invisible ones may be NaN
     store_rgb(out.means, seen(d.mean.x), seen(d.mean.y), seen(d.mean.z));
     store_rgb(out.log_scales, seen(d.log_scale.x), seen(d.log_scale.y), seen(d.log_scale.z));
-    Floats quats[kLanes] = {seen(d.qw), seen(d.qx), seen(d.qy), seen(d.qz)};
-    store_columns(out.quats, 4, quats);
+    Floats quats[4] = {seen(d.qw), seen(d.qx), seen(d.qy), seen(d.qz)};
+    store_fours(out.quats, quats);
     store(out.opacity_logits, seen(d.logit));
     Floats means2d[kLanes] = {seen(d.mean2d_x), seen(d.mean2d_y)};
     store_columns(out.means2d, 2, means2d);

@@ -154,14 +154,13 @@ void start_light(const TilePlace& at, int pairs, Light* light) {
 }
 
 // Pixels of a block that end at this pair. Rare.
-__attribute__((noinline)) void end_pixels(Light* light, int block, uint32_t which, int32_t pair) {
-    bool alive = false;
-    for (int lane = 0; lane < kLanes; ++lane) {
-        float& left = light->transmittance[block * kLanes + lane];
-        if (which >> lane & 1) light->end[block * kLanes + lane] = pair, left = -left;
-        alive |= left > 0.0f;
-    }
-    if (!alive) light->alive &= ~(BlockMask{1} << block);
+__attribute__((noinline)) void end_pixels(Light* light, int block, Mask which, int32_t pair) {
+    float* const at = light->transmittance + block * kLanes;
+    const Floats zero = fill(0.0f), before = load(at), left = select(which, zero - before, before);
+    store(at, left);
+    for (uint32_t lanes = bits(which); lanes; lanes &= lanes - 1)
+        light->end[block * kLanes + __builtin_ctz(lanes)] = pair;
+    if (!any(less(zero, left))) light->alive &= ~(BlockMask{1} << block);
 }
 
 SPLAT_INLINE void add_to(float* sum, Floats weight, Floats value) { store(sum, fma(weight, value, load(sum))); }

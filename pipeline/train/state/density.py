@@ -65,12 +65,10 @@ class Density:
         width, height = photo.share * whole.width, photo.share * whole.height
         score = torch.hypot(values[:, 0] * (0.5 * width), values[:, 1] * (0.5 * height)).nan_to_num_(0.0, 0.0, 0.0)
         if gradient_px.is_sparse:
-            rows = gradient_px.indices()[0]
-            self.score_sum.index_add_(0, rows, score)
-            self.seen.index_add_(0, rows, torch.ones_like(score))
+            self.score_sum.index_add_(0, gradient_px.indices()[0], score)
         else:
             self.score_sum += score.mul_(rendered.visible)
-            self.seen += rendered.visible
+        self.seen += rendered.visible
         if schedule.prune_screen_px > 0.0:
             torch.maximum(self.max_radius_px, rendered.radii, out=self.max_radius_px)
 
