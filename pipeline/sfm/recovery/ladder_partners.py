@@ -36,7 +36,7 @@ def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[
     layout = make_layout(capture.photos.photos, capture.positions)
     if has_informative_positions(layout):
         hints.append(_by_costs(left, spatial_costs(layout)))
-    hints.append(_by_costs(left, look_alike(capture.features, seed)))
+    hints.append(by_look(capture, left, seed))
     partners_by_photo: PartnersByPhoto = {}
     for photo in sorted(left):
         own = {member for group in groups if photo in group for member in group}
@@ -70,6 +70,11 @@ def by_model(found: MappingResult, left: Collection[int], placed: Collection[int
                 counts.update(member for row in rows.get(partner, []) for member, _ in tracks[row])
         partners_by_photo[photo] = sorted(counts, key=lambda member: (-counts[member], member))[:MAX_PARTNERS]
     return partners_by_photo
+
+
+def by_look(capture: MappingInput, photos: Collection[int], seed: int) -> PartnersByPhoto:
+    """Rank all photos by visual similarity with each of some photos."""
+    return _by_costs(photos, look_alike(capture.features, seed))
 
 
 def choose_pairs(partners_by_photo: PartnersByPhoto, avoided: Collection[Pair], most: int) -> list[Pair]:
