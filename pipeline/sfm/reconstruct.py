@@ -226,24 +226,23 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
 
     Returns the given attempt, or a better one from the extended graph.
     """
-    model, seed = answer.models[0], work.config.seed
-    if not is_thin(model, work.verified):
-        if not _unsure(answer, work.verified):
-            return answer
-        predicted = predicted_pairs(work.capture, model, (work.database, work.verified), many=False)
-        found = _add_pairs(work, answer, "predicted pairs", predicted)
-        return _rejudge(work, answer) if found.contradicting else answer
-    alike = alike_pairs(work.capture, model, work.database, seed)
-    mapped = bool(_add_pairs(work, answer, "pairs that look alike", alike).held)
-    if mapped:
-        answer = _mapped_with_more_pairs(work, answer)
-    predicted = predicted_pairs(work.capture, answer.models[0], (work.database, work.verified), many=True)
-    if not _add_pairs(work, answer, "predicted pairs", predicted).held:
+    mapped = False
+    if is_thin(answer.models[0], work.verified):
+        alike = alike_pairs(work.capture, answer.models[0], work.database, work.config.seed)
+        if _add_pairs(work, answer, "pairs that look alike", alike).held:
+            answer, mapped = _mapped_with_more_pairs(work, answer), True
+    thin = is_thin(answer.models[0], work.verified)
+    if not thin and not _unsure(answer, work.verified):
         return answer
-    if not mapped:
+    predicted = predicted_pairs(work.capture, answer.models[0], (work.database, work.verified))
+    found = _add_pairs(work, answer, "predicted pairs", predicted)
+    if thin and found.held and not mapped:
         return _mapped_with_more_pairs(work, answer)
-    answer = _rejudge(work, answer)
-    return _better(work.adjust(answer, "with more pairs", always=True), answer)
+    if found.contradicting or (thin and found.held):
+        answer = _rejudge(work, answer)
+    if thin and found.held:
+        answer = _better(work.adjust(answer, "with more pairs", always=True), answer)
+    return answer
 
 
 def _add_pairs(work: Reconstructor, answer: MappingAttempt, what: str, pairs: Sequence[Pair]) -> ProbeResult:

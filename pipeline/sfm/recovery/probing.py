@@ -25,7 +25,8 @@ from splatpipe.pipeline.sfm.recovery.ladder_partners import by_look, choose_pair
 PROBE_PAIRS = 24  # pairs: a few seconds' work, and enough for a meaningful share
 # verified pairs per photo; drone captures with overlap have 15 or more, chains and trees 2 to 5
 SPARSE_PAIRS_PER_PHOTO = 8.0
-FILL_PAIRS_PER_PHOTO = 6  # new pairs per photo for a sparse graph
+FILL_PAIRS_PER_PHOTO = 6  # predicted pairs per photo for a sparse graph
+ALIKE_PHOTOS = 12  # likest photos that each photo of a sparse graph is matched with: about as many pairs
 
 
 @dataclass(frozen=True)
@@ -69,22 +70,19 @@ def alike_pairs(capture: MappingInput, model: pycolmap.Reconstruction, database:
         seed: For the codebook.
     """
     ranked = by_look(capture, model.reg_image_ids(), seed)
-    return choose_pairs(ranked, capture.tried | tried_pairs(database), FILL_PAIRS_PER_PHOTO)
+    return choose_pairs(ranked, capture.tried | tried_pairs(database), ALIKE_PHOTOS)
 
 
-def predicted_pairs(
-    capture: MappingInput, model: pycolmap.Reconstruction, graph: tuple[Path, ViewGraph], many: bool
-) -> list[Pair]:
-    """Return pairs that show the same thing according to a model, and were never matched.
+def predicted_pairs(capture: MappingInput, model: pycolmap.Reconstruction, graph: tuple[Path, ViewGraph]) -> list[Pair]:
+    """Return pairs that show the same thing according to a model, and were never matched: more if the graph is thin.
 
     Args:
         capture: With the pairs that were matched first.
         model: A model with the keypoints of the graph.
         graph: The current database, and its view graph.
-        many: As many as a thin graph needs, instead of a sample.
     """
     database, verified = graph
-    count = FILL_PAIRS_PER_PHOTO * model.num_reg_images() if many else PROBE_PAIRS
+    count = FILL_PAIRS_PER_PHOTO * model.num_reg_images() if is_thin(model, verified) else PROBE_PAIRS
     return propose_pairs(model, verified, count, capture.tried | tried_pairs(database))
 
 
