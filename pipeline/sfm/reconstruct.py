@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -28,13 +28,8 @@ from splatpipe.pipeline.sfm.model.structure import (
 )
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
-from splatpipe.pipeline.sfm.recovery.probing import (
-    FILL_PAIRS_PER_PHOTO,
-    PROBE_PAIRS,
-    SPARSE_PAIRS_PER_PHOTO,
-    pairs_a_photo,
-    probe,
-)
+from splatpipe.pipeline.sfm.pairing.pairs import Pair
+from splatpipe.pipeline.sfm.recovery.probing import ProbeResult, alike_pairs, is_thin, predicted_pairs, probe
 from splatpipe.pipeline.sfm.recovery.refusal import refusal
 
 Model: TypeAlias = pycolmap.Reconstruction
@@ -45,7 +40,6 @@ MIN_SEEN = 15  # mean points per photo; COLMAP's minimum for a pair
 ENOUGH_SHARE = 0.5  # below this share, an attempt with relaxed thresholds is worth its time
 MAX_SHARE = 0.85  # below this share the other mapper may do better; above it the ladder places the rest more cheaply
 MIN_SCORE_MARGIN = 0.005  # score margin by which a second model must be better to replace the first
-ROUNDS = 2  # rounds of matching additional pairs
 MAX_FURTHER_MAPPINGS = 1  # mappings of a doubtful capture
 TEXTS = {"bent": "pairs of photos contradict it", "unexplained": "many matches are unexplained"}
 
@@ -232,26 +226,41 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
 
     Returns the given attempt, or a better one from the extended graph.
     """
-    for number in range(ROUNDS):
-        model = answer.models[0]
-        thin = pairs_a_photo(model, work.verified) < SPARSE_PAIRS_PER_PHOTO
-        if not thin and not _unsure(answer, work.verified):
-            break
-        count = FILL_PAIRS_PER_PHOTO * model.num_reg_images() if thin else PROBE_PAIRS
-        found = probe(work.capture, model, (work.database, work.verified), count, work.config.seed, work.report)
-        if not found.held:
-            break
-        note = f"{found.held} of {found.tried} predicted pairs were verified, {found.contradicting} contradict it"
-        work.add_note(answer, note)
-        work.database, work.verified = found.database, found.verified
-        if thin or found.contradicting:
-            answer = _rejudge(work, answer)
-        if not thin:
-            break
-        work.further += number == 0
-        again = work.map_further(answer.mapper, f"{answer.mapper}, with more pairs") if number == 0 else None
-        answer = _better(again or work.adjust(answer, "with more pairs", always=True), answer)
+    mapped = False
+    if is_thin(answer.models[0], work.verified):
+        alike = alike_pairs(work.capture, answer.models[0], work.database, work.config.seed)
+        if _add_pairs(work, answer, "pairs that look alike", alike).held:
+            answer, mapped = _mapped_with_more_pairs(work, answer), True
+    thin = is_thin(answer.models[0], work.verified)
+    if not thin and not _unsure(answer, work.verified):
+        return answer
+    predicted = predicted_pairs(work.capture, answer.models[0], (work.database, work.verified))
+    found = _add_pairs(work, answer, "predicted pairs", predicted)
+    if thin and found.held and not mapped:
+        return _mapped_with_more_pairs(work, answer)
+    if found.contradicting or (thin and found.held):
+        answer = _rejudge(work, answer)
+    if thin and found.held:
+        answer = _better(work.adjust(answer, "with more pairs", always=True), answer)
     return answer
+
+
+def _add_pairs(work: Reconstructor, answer: MappingAttempt, what: str, pairs: Sequence[Pair]) -> ProbeResult:
+    """Match pairs, go on with the graph that they extend, and note what they say of an attempt."""
+    graph = work.database, work.verified
+    found = probe(work.capture, answer.models[0], graph, pairs, work.config.seed, work.report)
+    work.database, work.verified = found.database, found.verified
+    if found.held:
+        text = f"{found.held} of {found.tried} {what} were verified, {found.contradicting} contradict it"
+        work.add_note(answer, text)
+    return found
+
+
+def _mapped_with_more_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttempt:
+    """Return the attempt, or a better one by the same mapper from the graph as it is now."""
+    answer = _rejudge(work, answer)
+    work.further += 1
+    return _better(work.map_further(answer.mapper, f"{answer.mapper}, with more pairs"), answer)
 
 
 def _unsure(answer: MappingAttempt, verified: ViewGraph) -> bool:

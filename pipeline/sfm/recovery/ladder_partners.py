@@ -34,8 +34,8 @@ def rank_partners(capture: MappingInput, found: MappingResult, left: Collection[
     hints = [by_matches(found, left, placed), by_model(found, left, placed)]
     layout = make_layout(capture.photos.photos, capture.positions)
     if has_informative_positions(layout):
-        hints.append(_by_costs(left, spatial_costs(layout)))
-    hints.append(_by_costs(left, alike))
+        hints.append(by_costs(left, spatial_costs(layout)))
+    hints.append(by_costs(left, alike))
     partners_by_photo: PartnersByPhoto = {}
     for photo in sorted(left):
         own = {member for group in groups if photo in group for member in group}
@@ -89,7 +89,7 @@ def choose_pairs(partners_by_photo: PartnersByPhoto, avoided: Collection[Pair], 
     return sorted(chosen)
 
 
-def _by_costs(left: Collection[int], costs: Costs) -> PartnersByPhoto:
+def by_costs(left: Collection[int], costs: Costs) -> PartnersByPhoto:
     """Rank other photos by cost, lowest first, where it is known."""
     partners_by_photo = {}
     for photo in sorted(left):

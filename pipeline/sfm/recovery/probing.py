@@ -1,11 +1,14 @@
-"""Probe a model by matching pairs that show the same thing according to the model but were never matched.
+"""Probe a model by matching pairs of its photos that were never matched.
 
 With few pairs, a bent model may contradict none of its matches. Its predictions for other pairs then confirm or refute
-it, and their matches help to correct it.
+it, and their matches help to correct it. But what a model predicts tends to confirm it: where a pattern repeats, photos
+that the model has in the wrong place match their neighbours there, too. So if the graph is thin, the pairs that look
+most alike come first, whatever the model has.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,13 +17,17 @@ import pycolmap
 from splatpipe.pipeline.engine.stage import Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput
 from splatpipe.pipeline.sfm.judging.agreement import compare, contradicting
+from splatpipe.pipeline.sfm.matching.matching import look_alike
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph, read_verified
+from splatpipe.pipeline.sfm.pairing.pairs import Pair
 from splatpipe.pipeline.sfm.recovery.ladder_pairs import match_more, propose_pairs, tried_pairs
+from splatpipe.pipeline.sfm.recovery.ladder_partners import by_costs, choose_pairs
 
 PROBE_PAIRS = 24  # pairs: a few seconds' work, and enough for a meaningful share
 # verified pairs per photo; drone captures with overlap have 15 or more, chains and trees 2 to 5
 SPARSE_PAIRS_PER_PHOTO = 8.0
-FILL_PAIRS_PER_PHOTO = 6  # new pairs per photo for a sparse graph
+FILL_PAIRS_PER_PHOTO = 6  # predicted pairs per photo for a sparse graph
+ALIKE_PHOTOS = 12  # likest photos that each photo of a sparse graph is matched with: about as many pairs
 
 
 @dataclass(frozen=True)
@@ -49,26 +56,56 @@ def pairs_a_photo(model: pycolmap.Reconstruction, verified: ViewGraph) -> float:
     return 2.0 * inside / max(len(placed), 1)
 
 
+def is_thin(model: pycolmap.Reconstruction, verified: ViewGraph) -> bool:
+    """Whether a model's photos have so few verified pairs that these may hide a bend."""
+    return pairs_a_photo(model, verified) < SPARSE_PAIRS_PER_PHOTO
+
+
+def alike_pairs(capture: MappingInput, model: pycolmap.Reconstruction, database: Path, seed: int) -> list[Pair]:
+    """Return the pairs of a model's photos that look most alike and were never matched.
+
+    Args:
+        capture: Supplies the descriptors.
+        model: Any model.
+        database: With the pairs that were matched after the capture's.
+        seed: For the codebook.
+    """
+    ranked = by_costs(model.reg_image_ids(), look_alike(capture.features, seed))
+    return choose_pairs(ranked, capture.tried | tried_pairs(database), ALIKE_PHOTOS)
+
+
+def predicted_pairs(capture: MappingInput, model: pycolmap.Reconstruction, graph: tuple[Path, ViewGraph]) -> list[Pair]:
+    """Return pairs that show the same thing according to a model, and were never matched: more if the graph is thin.
+
+    Args:
+        capture: With the pairs that were matched first.
+        model: A model with the keypoints of the graph.
+        graph: The current database, and its view graph.
+    """
+    database, verified = graph
+    count = FILL_PAIRS_PER_PHOTO * model.num_reg_images() if is_thin(model, verified) else PROBE_PAIRS
+    return propose_pairs(model, verified, count, capture.tried | tried_pairs(database))
+
+
 def probe(
     capture: MappingInput,
     model: pycolmap.Reconstruction,
     graph: tuple[Path, ViewGraph],
-    count: int,
+    pairs: Sequence[Pair],
     seed: int,
     report: Reporter,
 ) -> ProbeResult:
-    """Match pairs that show the same thing according to a model, and check the model against them.
+    """Match pairs of a model's photos, and check the model against them.
 
     Args:
         capture: Supplies the descriptors.
         model: A model with the keypoints of the graph.
         graph: The current database, and its view graph.
-        count: Maximum number of pairs.
+        pairs: The pairs, (i, j), i < j.
         seed: For the verification.
         report: Receives progress.
     """
     database, verified = graph
-    pairs = propose_pairs(model, verified, count, capture.tried | tried_pairs(database))
     if not pairs:
         return ProbeResult(database, verified, 0, 0, 0)
     grown = match_more(capture, database, pairs, seed, report)

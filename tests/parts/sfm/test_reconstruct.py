@@ -17,7 +17,7 @@ from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions
 from splatpipe.pipeline.sfm.model.view_graph import read_verified
 from splatpipe.pipeline.sfm.options import SparseConfig
 from splatpipe.pipeline.sfm.reconstruct import MappingAttempt, Reconstructor, reconstruct
-from splatpipe.pipeline.sfm.recovery.probing import probe
+from splatpipe.pipeline.sfm.recovery.probing import alike_pairs, predicted_pairs, probe
 
 
 def capture_of(ring: Ring, folder: Path, reach: int = 99) -> MappingInput:
@@ -127,7 +127,7 @@ def test_nothing_is_mapped_twice_if_nothing_is_doubtful(tmp_path: Path) -> None:
     assert far_off(ring, found.model) < 0.002
 
 
-def test_pairs_predicted_by_a_bent_model_prove_the_bend(tmp_path: Path) -> None:
+def test_new_pairs_prove_that_a_model_is_bent(tmp_path: Path) -> None:
     """A chain whose joint no pair spans: nothing contradicts the bend before new pairs are matched."""
     ring = make_ring(reach=3)
     capture = capture_of(ring, tmp_path / "capture", reach=1)
@@ -139,18 +139,19 @@ def test_pairs_predicted_by_a_bent_model_prove_the_bend(tmp_path: Path) -> None:
     for photos, world in ((range(1, 14), still), (range(14, 25), shifted)):
         add_points(right, ring, photos, still)
         add_points(bent, ring, photos, world)
-    notes = [
-        probe(capture, model, (capture.database, verified), 48, 0, corner_photos.Recorder()) for model in (right, bent)
-    ]
-    assert notes[0].held > 20 and notes[0].contradicting == 0
-    assert notes[1].contradicting >= 3
-    assert [
-        judge(model, capture.verified, [{}]).level for model, capture in zip((right, bent), notes, strict=True)
-    ] == [
-        "good",
-        "bad",
-    ]
-    assert len(notes[1].verified.matches) == len(verified.matches) + notes[1].held
+    graph = capture.database, verified
+    alike = alike_pairs(capture, right, capture.database, 0)
+    assert alike == alike_pairs(capture, bent, capture.database, 0) and not set(alike) & set(verified.matches)
+    for pairs in ([predicted_pairs(capture, model, graph)[:48] for model in (right, bent)], [alike, alike]):
+        notes = [
+            probe(capture, model, graph, more, 0, corner_photos.Recorder())
+            for model, more in zip((right, bent), pairs, strict=True)
+        ]
+        assert notes[0].held > 20 and notes[0].contradicting == 0
+        assert notes[1].contradicting >= 3
+        assert len(notes[1].verified.matches) == len(verified.matches) + notes[1].held
+        levels = [judge(model, note.verified, [{}]).level for model, note in zip((right, bent), notes, strict=True)]
+        assert levels == ["good", "bad"]
 
 
 def test_a_thin_chain_gets_more_pairs_and_is_mapped_correctly(tmp_path: Path) -> None:
