@@ -102,7 +102,7 @@ STAGES = {
     "control": StageCosts(0.1, {}, 0.0, 180e6, {}, {}),
     "features": StageCosts(0.287, {"searched": 1}, 0.98, 157e6, {"searched_at_once": 266e6}, {"keypoints": 156}),
     "matches": StageCosts(1.36e-5, {"compared": 1}, 0.97, 250e6, {"threads": 185e6}, {"keypoints": 30.1}),
-    "sparse": StageCosts(0.548, {"photos": 1, "crowd": 0.75, "doubt": 1}, 0.2, 215e6, MAPPED, {"keypoints": 31.4}),
+    "sparse": StageCosts(0.472, {"photos": 1, "crowd": 0.75, "doubt": 1}, 0.2, 215e6, MAPPED, {"keypoints": 31.2}),
     "targets": StageCosts(0.21, {"control_pixels": 1}, 0.0, 230e6, {"tiles_at_once": 100e6}, {}),
     "georef": StageCosts(0.019, {"photos": 1}, 0.0, 157e6, {"keypoints": 724}, {"keypoints": 30.4}),
     "undistort": StageCosts(0.0363, {"pixels": 1}, 0.8, 241e6, {"pixels_at_once": 18.2e6}, {"dataset": 0.598e6}),

@@ -16,7 +16,7 @@ SIFT_MEMORY = {"opencv-sift": 1.0, "sift": 1.5}  # memory per thread relative to
 MAX_KEYPOINTS = 1.3  # times max_features: several orientations, whole scales
 NEIGHBOURS = 20  # per photo, behind `Costs.pairs`
 PHOTOS_OF_ONE_COST = 50  # up to this many photos, mapping costs the constant per photo; with more photos it costs more
-WITHOUT_POSITIONS = 2.5  # times the mapping cost: pairs that only look alike, doubts, second mappings
+WITHOUT_POSITIONS = 1.8  # times the mapping cost: pairs that only look alike, doubts, second mappings
 RETRIED_MEGAPIXELS = 4.3  # size of an image in which unplaced photos get further keypoints, on half of the threads
 TARGETS_TILE = 2.4  # megapixels of a tile in which targets are searched
 
