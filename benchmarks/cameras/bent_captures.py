@@ -2,7 +2,7 @@
 
     bent_captures DEMO_OUT [--others OUT …] [--folds OUT …] [--sound OUT …] [--only NAME …]
 
-Each OUT is a run up to `matches` (``splatpipe run demo/capture OUT --preset preview --until matches``). Ten variants
+Each OUT is a run up to `matches` (``splatpipe run demo/capture/photos OUT --preset preview --until matches``). Ten variants
 are derived from the demo's database: the focal length is no longer known (COLMAP's guess of 1.2 times the longer side,
 without a prior), and verified pairs are thinned by a rule and a seed until incremental mapping goes wrong: random trees
 of pairs, so that no loop closes; trees with a few triangles; the photo sequence with a few bridges; matches

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -13,6 +14,7 @@ import pycolmap
 
 from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.sfm.capture import MappingInput, MappingResult
+from splatpipe.pipeline.sfm.judging.agreement import compare
 from splatpipe.pipeline.sfm.judging.judging import Judgement, judge
 from splatpipe.pipeline.sfm.lenses.focal import MAX_UNOBSERVED_DEVIATION, adjust_within, undetermined_sigma
 from splatpipe.pipeline.sfm.mapping.completion import complete
@@ -226,23 +228,38 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
 
     Returns the given attempt, or a better one from the extended graph.
     """
-    mapped = False
-    if is_thin(answer.models[0], work.verified):
+    thin, mapped = is_thin(answer.models[0], work.verified), False
+    if thin:
         alike = alike_pairs(work.capture, answer.models[0], work.database, work.config.seed)
         if _add_pairs(work, answer, "pairs that look alike", alike).held:
             answer, mapped = _mapped_with_more_pairs(work, answer), True
-    thin = is_thin(answer.models[0], work.verified)
-    if not thin and not _unsure(answer, work.verified):
+    elif not _unsure(answer, work.verified):
         return answer
-    predicted = predicted_pairs(work.capture, answer.models[0], (work.database, work.verified))
-    found = _add_pairs(work, answer, "predicted pairs", predicted)
-    if thin and found.held and not mapped:
-        return _mapped_with_more_pairs(work, answer)
-    if found.contradicting or (thin and found.held):
-        answer = _rejudge(work, answer)
-    if thin and found.held:
-        answer = _better(work.adjust(answer, "with more pairs", always=True), answer)
-    return answer
+    graph = work.database, work.verified
+    found = _add_pairs(work, answer, "predicted pairs", predicted_pairs(work.capture, answer.models[0], graph, thin))
+    if not thin:
+        return _rejudge(work, answer) if found.contradicting else answer
+    if not found.held:
+        return answer
+    return _adjusted_to_predictions(work, answer, graph) if mapped else _mapped_with_more_pairs(work, answer)
+
+
+def _adjusted_to_predictions(
+    work: Reconstructor, answer: MappingAttempt, graph: tuple[Path, ViewGraph]
+) -> MappingAttempt:
+    """Return the attempt adjusted to the pairs that it predicted, unless the others then agree less.
+
+    What a model predicts tends to confirm it, or what it becomes: where a pattern repeats, photos in the wrong place
+    match their neighbours there, too. So such pairs are left out again if the others, of ``graph``, contradict them.
+    """
+    answer = _rejudge(work, answer)
+    grown = work.adjust(answer, "with more pairs", always=True)
+    before, after = (compare(attempt.models[0], graph[1]).score for attempt in (answer, grown))
+    if after >= before - MIN_SCORE_MARGIN:
+        return _better(grown, answer)
+    work.add_note(grown, "the pairs that were not predicted contradict it")
+    work.database, work.verified = graph
+    return _rejudge(work, answer)
 
 
 def _add_pairs(work: Reconstructor, answer: MappingAttempt, what: str, pairs: Sequence[Pair]) -> ProbeResult:

@@ -74,16 +74,19 @@ def alike_pairs(capture: MappingInput, model: pycolmap.Reconstruction, database:
     return choose_pairs(ranked, capture.tried | tried_pairs(database), ALIKE_PHOTOS)
 
 
-def predicted_pairs(capture: MappingInput, model: pycolmap.Reconstruction, graph: tuple[Path, ViewGraph]) -> list[Pair]:
-    """Return pairs that show the same thing according to a model, and were never matched: more if the graph is thin.
+def predicted_pairs(
+    capture: MappingInput, model: pycolmap.Reconstruction, graph: tuple[Path, ViewGraph], many: bool
+) -> list[Pair]:
+    """Return pairs that show the same thing according to a model, and were never matched.
 
     Args:
         capture: With the pairs that were matched first.
         model: A model with the keypoints of the graph.
         graph: The current database, and its view graph.
+        many: As many as a sparse graph lacks, instead of a sample.
     """
     database, verified = graph
-    count = FILL_PAIRS_PER_PHOTO * model.num_reg_images() if is_thin(model, verified) else PROBE_PAIRS
+    count = FILL_PAIRS_PER_PHOTO * model.num_reg_images() if many else PROBE_PAIRS
     return propose_pairs(model, verified, count, capture.tried | tried_pairs(database))
 
 

@@ -142,7 +142,7 @@ def test_new_pairs_prove_that_a_model_is_bent(tmp_path: Path) -> None:
     graph = capture.database, verified
     alike = alike_pairs(capture, right, capture.database, 0)
     assert alike == alike_pairs(capture, bent, capture.database, 0) and not set(alike) & set(verified.matches)
-    for pairs in ([predicted_pairs(capture, model, graph)[:48] for model in (right, bent)], [alike, alike]):
+    for pairs in ([predicted_pairs(capture, model, graph, many=True)[:48] for model in (right, bent)], [alike, alike]):
         notes = [
             probe(capture, model, graph, more, 0, corner_photos.Recorder())
             for model, more in zip((right, bent), pairs, strict=True)
