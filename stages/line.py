@@ -53,7 +53,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=11,
+    version=12,
     config=SparseConfig,
     reads=(
         "matches.database",

@@ -2,12 +2,12 @@
 
     bent_captures DEMO_OUT [--others OUT …] [--folds OUT …] [--sound OUT …] [--only NAME …]
 
-Each OUT is a run up to `matches` (``splatpipe run demo/capture/photos OUT --preset preview --until matches``). Ten variants
-are derived from the demo's database: the focal length is no longer known (COLMAP's guess of 1.2 times the longer side,
-without a prior), and verified pairs are thinned by a rule and a seed until incremental mapping goes wrong: random trees
-of pairs, so that no loop closes; trees with a few triangles; the photo sequence with a few bridges; matches
-only near the image centre.
-Of every other capture (castle and fox, of rows of windows and a patterned wallpaper) five variants are derived.
+Each OUT is a run up to `matches` (``splatpipe run demo/capture/photos OUT --preset preview --until matches``). Ten
+variants are derived from the demo's database: the focal length is no longer known (COLMAP's guess of 1.2 times the
+longer side, without a prior), and verified pairs are thinned by a rule and a seed until incremental mapping goes wrong:
+random trees of pairs, so that no loop closes; trees with a few triangles; the photo sequence with a few bridges;
+matches only near the image centre. Of every other capture (castle and fox, of rows of windows and a patterned
+wallpaper) five variants are derived.
 
 Each variant is mapped by the pipeline. The error is the RMS distance of the camera centres from the truth after a
 least-squares similarity: the demo's known one, otherwise the cameras of the whole capture. The answer is right if nine
