@@ -83,7 +83,7 @@ def camera_rows(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Se
     """Return a row per camera in the model: name, photos, photos placed, focal lengths, reprojection error."""
     placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     photos = Counter(verified.camera_of.values())
-    errors = _errors_px(model, verified)
+    errors = _errors_px(model)
     rows = []
     for number, camera in sorted(model.cameras.items()):
         group = cameras[number - 1] if number <= len(cameras) else {}
@@ -114,7 +114,7 @@ def report_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None
         report.note(f"Camera {row['id']}, {row['name'] or 'unknown'}: {placed}, focal length {focal}{error}.")
 
 
-def _errors_px(model: pycolmap.Reconstruction, verified: ViewGraph) -> dict[int, float]:
+def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
     """Return the mean reprojection error of each camera's observations, pixels."""
     result = {}
     points = model.points3D
@@ -123,12 +123,12 @@ def _errors_px(model: pycolmap.Reconstruction, verified: ViewGraph) -> dict[int,
     for number in sorted(model.cameras):
         camera, total, count = model.cameras[number], 0.0, 0
         for image in (model.images[i] for i in sorted(model.reg_image_ids())):
-            seen = [point.point3D_id for point in image.get_observation_points2D()]
-            if seen and image.camera_id == number:
+            seen = image.get_observation_points2D() if image.camera_id == number else []
+            if seen:
                 pose = np.asarray(image.cam_from_world().matrix(), np.float64)
-                projected, _ = project_through_lens(camera, pose, all_places[np.searchsorted(numbers, seen)])
-                pixels = verified.keypoints[image.image_id][image.get_observation_point2D_idxs()]
-                off = np.linalg.norm(projected - pixels.astype(np.float64), axis=1)
+                rows = np.searchsorted(numbers, [point.point3D_id for point in seen])
+                projected, _ = project_through_lens(camera, pose, all_places[rows])
+                off = np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1)
                 total, count = total + float(off[np.isfinite(off)].sum()), count + int(np.isfinite(off).sum())
         if count and math.isfinite(total):
             result[number] = round(total / count, 4)
