@@ -230,7 +230,7 @@ def _with_new_pairs(work: Reconstructor, answer: MappingAttempt) -> MappingAttem
     """
     thin, mapped = is_thin(answer.models[0], work.verified), False
     if thin:
-        alike = alike_pairs(work.capture, answer.models[0], work.database, work.config.seed)
+        alike = alike_pairs(work.capture, (work.database, work.verified), work.config.seed)
         if _add_pairs(work, answer, "pairs that look alike", alike).held:
             answer, mapped = _mapped_with_more_pairs(work, answer), True
     elif not _unsure(answer, work.verified):

@@ -1,4 +1,4 @@
-"""Probe a model by matching pairs of its photos that were never matched.
+"""Probe a model by matching pairs of photos that were never matched.
 
 With few pairs, a bent model may contradict none of its matches. Its predictions for other pairs then confirm or refute
 it, and their matches help to correct it. But what a model predicts tends to confirm it: where a pattern repeats, photos
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import pycolmap
@@ -61,17 +62,19 @@ def is_thin(model: pycolmap.Reconstruction, verified: ViewGraph) -> bool:
     return pairs_a_photo(model, verified) < SPARSE_PAIRS_PER_PHOTO
 
 
-def alike_pairs(capture: MappingInput, model: pycolmap.Reconstruction, database: Path, seed: int) -> list[Pair]:
-    """Return the pairs of a model's photos that look most alike and were never matched.
+def alike_pairs(capture: MappingInput, graph: tuple[Path, ViewGraph], seed: int) -> list[Pair]:
+    """Return the pairs of photos that look most alike and were never matched.
 
     Args:
         capture: Supplies the descriptors.
-        model: Any model.
-        database: With the pairs that were matched after the capture's.
+        graph: The current database, and its view graph.
         seed: For the codebook.
     """
-    ranked = by_costs(model.reg_image_ids(), look_alike(capture.features, seed))
-    return choose_pairs(ranked, capture.tried | tried_pairs(database), ALIKE_PHOTOS)
+    database, verified = graph
+    tried = capture.tried | tried_pairs(database)
+    if tried.issuperset(combinations(sorted(verified.names), 2)):
+        return []
+    return choose_pairs(by_costs(verified.names, look_alike(capture.features, seed)), tried, ALIKE_PHOTOS)
 
 
 def predicted_pairs(
@@ -98,7 +101,7 @@ def probe(
     seed: int,
     report: Reporter,
 ) -> ProbeResult:
-    """Match pairs of a model's photos, and check the model against them.
+    """Match pairs of photos, and check a model against them.
 
     Args:
         capture: Supplies the descriptors.
