@@ -72,7 +72,7 @@ def test_auto_uses_the_other_mapper_if_the_first_one_fails(weak: tuple[Ring, Map
 def test_the_other_mappers_focal_length_is_held_as_well_if_the_photos_do_not_determine_it(
     weak: tuple[Ring, MappingInput], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatpipe.pipeline.sfm.reconstruct.UNOBSERVED", 1e-12)
+    monkeypatch.setattr("splatpipe.pipeline.sfm.lenses.focal.UNOBSERVED", 1e-12)
     monkeypatch.setattr("splatpipe.pipeline.sfm.reconstruct.MAX_UNOBSERVED_DEVIATION", 1e-6)
     found = reconstruct(weak[1], SparseConfig(), corner_photos.Recorder())
     assert [(row["how"], row["chosen"]) for row in found.tried] == [
