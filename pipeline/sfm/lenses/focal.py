@@ -74,11 +74,14 @@ def undetermined_sigma(model: pycolmap.Reconstruction, cameras: Collection[int])
     """
     points = sorted(model.points3D)
     step = -(-len(points) // ENOUGH_POINTS)
-    fewer = pycolmap.Reconstruction(model)
-    for place, number in enumerate(points):
-        if place % step:
-            fewer.delete_point3D(number)
-    for each in (fewer, model) if step > 1 else (model,):
+    asked = [model]
+    if step > 1:
+        fewer = pycolmap.Reconstruction(model)
+        for place, number in enumerate(points):
+            if place % step:
+                fewer.delete_point3D(number)
+        asked = [fewer, model]
+    for each in asked:
         sigmas = focal_sigmas(each)
         worst = max((sigmas.get(number, math.inf) for number in cameras), default=0.0)
         if worst <= UNOBSERVED:
