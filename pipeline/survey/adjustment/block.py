@@ -78,16 +78,27 @@ class Block:
         """The number of unknowns without the tie points."""
         return 6 * len(self) + sum(len(lens.names) for lens in self.lenses)
 
-    def moved(self, step: Float64[np.ndarray, " q"], points: Float64[np.ndarray, "p 3"]) -> Block:
-        """The block after a step of its unknowns, with new tie points."""
+    def moved(self, step: Float64[np.ndarray, " q"], shifts: Float64[np.ndarray, "p 3"]) -> Block:
+        """The block after a step of its unknowns and shifts of its tie points.
+
+        What all photos turn by alike is applied as a rotation of the whole block: along the tangent, a turn that only
+        loose control resists would stretch the block, and steps would have to stay small.
+        """
         n = len(self)
-        turns = rotation_from_vector(step[: 3 * n].reshape(n, 3))
+        turns, shift = step[: 3 * n].reshape(n, 3), step[3 * n : 6 * n].reshape(n, 3)
+        turned = -np.einsum("nij,ni->nj", self.rotations, turns).mean(axis=0)  # world axes, radians
+        rotation, tangent, pivot = rotation_from_vector(turned), cross_matrix(turned), self.centres.mean(axis=0)
+
+        def placed(places: Float64[np.ndarray, "k 3"], by: Float64[np.ndarray, "k 3"]) -> Float64[np.ndarray, "k 3"]:
+            around = places - pivot
+            return np.asarray(pivot + (around + by - around @ tangent.T) @ rotation.T)
+
         return replace(
             self,
-            rotations=turns @ self.rotations,
-            centres=self.centres + step[3 * n : 6 * n].reshape(n, 3),
+            rotations=rotation_from_vector(turns + self.rotations @ turned) @ self.rotations @ rotation.T,
+            centres=placed(self.centres, shift),
             lenses=tuple(lens.moved(step[where]) for lens, where in zip(self.lenses, self.lens_slices, strict=True)),
-            points=points,
+            points=placed(self.points, shifts),
         )
 
     def residuals(self) -> Float64[np.ndarray, "m 2"]:

@@ -15,7 +15,8 @@ from splatpipe.pipeline.survey.adjustment.block import Block, Normal, ReducedBlo
 ROUNDS = 60
 MIN_DECREASE = 1e-3  # decrease of the sum of squares: a thirtieth of a standard deviation
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
-EASIER, HARDER = 0.1, 10.0
+# factors on the damping: after a step that helped, the same once one has not, after one that did not help
+EASIER, CAUTIOUS, HARDER = 0.01, 0.3, 10.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,8 @@ def adjust_block(
     """
     if offsets is None:
         offsets = np.zeros_like(positions.offset_sigmas)
-    cost, damping, converged = block.cost() + positions.cost(block, offsets), DAMPING, False
+    cost, converged = block.cost() + positions.cost(block, offsets), False
+    damping, easier = DAMPING, EASIER
     reduced = reduce_block(block)
     for _ in range(rounds):
         normal, gradient = joint_system(reduced, positions, block, offsets)
@@ -94,13 +96,13 @@ def adjust_block(
         if gain < MIN_DECREASE:
             converged = True
             break
-        moved = block.moved(step[: block.unknowns], block.points + reduced.points_after(step[: block.unknowns]))
+        moved = block.moved(step[: block.unknowns], reduced.points_after(step[: block.unknowns]))
         moved = settle_points(moved)
         shifted = offsets + step[block.unknowns :].reshape(-1, 3)
         after = moved.cost() + positions.cost(moved, shifted)
 
         if after < cost:
-            block, offsets, damping = moved, shifted, max(EASIER * damping, LEAST_DAMPING)
+            block, offsets, damping = moved, shifted, max(easier * damping, LEAST_DAMPING)
             converged = cost - after < MIN_DECREASE
             cost = after
             reduced = reduce_block(block)
@@ -109,7 +111,7 @@ def adjust_block(
         elif damping > MOST_DAMPING:
             break
         else:
-            damping *= HARDER
+            damping, easier = HARDER * damping, CAUTIOUS
     return AdjustedBlock(block, offsets, reduced, cost, converged)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from splatpipe.pipeline.geometry.similarity import rotation_from_vector
 from splatpipe.pipeline.survey.adjustment import block as block_module
 from splatpipe.pipeline.survey.adjustment.adjusted_positions import height_sentence
 from splatpipe.pipeline.survey.adjustment.block import Block, part_of, reduce_block, settle_points
@@ -52,7 +53,7 @@ def test_gradient_is_the_derivative_of_the_cost_with_points_settled(flight: Flow
     sizes = 1.0 / np.sqrt(np.diag(reduced.normal))
     for _ in range(3):
         step = 1e-2 * rng.normal(size=block.unknowns) * sizes
-        ahead, back = (settle_points(block.moved(side * step, block.points), 8).cost() for side in (1.0, -1.0))
+        ahead, back = (settle_points(block.moved(side * step, np.zeros_like(block.points)), 8).cost() for side in (1.0, -1.0))
         assert (ahead - back) / 2.0 == pytest.approx(2.0 * float(reduced.gradient @ step), rel=1e-3)
 
 
@@ -70,7 +71,7 @@ def test_distances_join_their_points_in_the_equations(flight: FlownBlock) -> Non
     sizes = 1.0 / np.sqrt(np.diag(reduced.normal))
     for _ in range(3):
         step = 1e-2 * rng.normal(size=block.unknowns) * sizes
-        ahead, back = (settle_points(block.moved(side * step, block.points), 8).cost() for side in (1.0, -1.0))
+        ahead, back = (settle_points(block.moved(side * step, np.zeros_like(block.points)), 8).cost() for side in (1.0, -1.0))
         assert (ahead - back) / 2.0 == pytest.approx(2.0 * float(reduced.gradient @ step), rel=2e-3)
     alone = reduce_block(replace(block, distances=part_of(block, np.zeros(len(block), dtype=bool)).distances))
     assert np.linalg.eigvalsh(reduced.normal - alone.normal).min() > -1e-6 * np.diag(alone.normal).max()
@@ -102,6 +103,18 @@ def test_exact_observations_give_the_true_block() -> None:
     assert np.abs(ground_errors(done.block, exact)).max() < 0.02
     assert np.abs(done.block.centres - exact.truth.centres).max() < 1e-3
     assert np.abs(image_errors(done.block)).max() < 0.01
+
+
+def test_a_block_that_only_loose_positions_hold_is_turned_back_in_a_few_steps() -> None:
+    loose = flown(sigmas_m=(1.0, 1.0, 1.0))
+    start, tilt = loose.start, rotation_from_vector(np.array([0.2, -0.1, 0.3]))
+    tilted = replace(
+        start, rotations=start.rotations @ tilt.T, centres=start.centres @ tilt.T, points=start.points @ tilt.T
+    )
+    observed = as_stated(loose.positions).observations(loose.positions)
+    done, level = adjust_block(tilted, observed, rounds=12), adjust_block(start, observed)
+    assert done.converged
+    assert done.cost == pytest.approx(level.cost, abs=0.1)
 
 
 def test_a_bent_start_is_straightened_and_the_lens_is_found(flight: FlownBlock, fitted: BlockFit) -> None:
