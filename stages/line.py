@@ -79,7 +79,7 @@ CONTROL = Stage(
 )
 TARGETS = Stage(
     "targets",
-    version=3,
+    version=4,
     config=TargetsConfig,
     reads=("control.points", "sparse.model", "ingest.photos", "ingest.positions"),
     parts={"found": "targets.json"},
@@ -88,7 +88,7 @@ TARGETS = Stage(
 )
 GEOREF = Stage(
     "georef",
-    version=14,
+    version=15,
     config=GeorefConfig,
     reads=(
         "sparse.model",
@@ -133,7 +133,7 @@ SPLIT = Stage(
 )
 INITIALIZE = Stage(
     "initialize",
-    version=6,
+    version=7,
     config=InitializeConfig,
     reads=("undistort.dataset", "split.views", "georef.boundary"),
     parts={"splat": "init.ply"},
@@ -248,7 +248,7 @@ FLYTHROUGH = Stage(
 
 DEPTHS = Stage(
     "depths",
-    version=2,
+    version=3,
     config=DepthsConfig,
     reads=("undistort.dataset",),
     parts={"maps": "maps"},

@@ -11,11 +11,9 @@ namespace splat {
 namespace SPLAT_ISA_NAMESPACE {
 namespace {
 
-constexpr int kSamples = 32;     // of a round window: 6 x 6, two pixels apart, without the corners
-constexpr int kLooked = 4;       // number of photos in which a pixel's planes are tried: the most similar ones so far
-constexpr int kBest = 2;         // number of photos whose costs count
-constexpr int kNoView = 255;     // instead of a photo's index
-constexpr float kUnlike = 1.2f;  // cost above which a photo is uninformative: it shows something else
+constexpr int kSamples = 32;            // of a round window: 6 x 6, two pixels apart, without the corners
+constexpr int kNoView = 255;            // instead of a photo's index
+constexpr float kUnlike = 1.2f;         // cost above which a photo is uninformative: it shows something else
 constexpr float kNoise2 = 1.5f * 1.5f;  // variance of grey values: contrast below it does not count as similarity
 constexpr float kPerGrey = 0.047f;      // of a weight's logarithm to base two
 constexpr float kPerPixel2 = 0.028f;    // the same, by squared distance
@@ -100,29 +98,47 @@ void open_window(const PatchJob& job, int column, int row, Window* window) {
     window->variance = sum_lanes(spread);
 }
 
-// One minus the correlation, or kPatchWorst where the photo does not show the pixel.
-float view_cost(const PatchView& view, const Window& window, const Plane& plane) {
-    const float* turn = view.turn;
-    const float rest = plane.inverse - plane.across * window.x - plane.down * window.y;
-    float right[3], down[3], at[3];  // change of the homogeneous pixel per step, and the image of the centre
-    for (int k = 0; k < 3; ++k) {
-        right[k] = turn[3 * k] + view.shift[k] * plane.across;
-        down[k] = turn[3 * k + 1] + view.shift[k] * plane.down;
-        at[k] = right[k] * window.x + down[k] * window.y + (turn[3 * k + 2] + view.shift[k] * rest);
+// One value for each of four photos, which are compared with at once.
+constexpr int kFour = 4;
+using Fours = float __attribute__((vector_size(4 * kFour)));
+
+SPLAT_INLINE Fours at_most(Fours a, float b) { return a < b ? a : Fours{} + b; }
+
+// Four photos as a pixel sees them: a plane (inverse, across, down) at the pixel's centre carries it to at + shift
+// inverse, and a step to the right changes that by right + shift across, one down by down + shift down.
+struct Four {
+    const PatchView* view[kFour];  // null: none
+    Fours at[3], right[3], down[3], shift[3];
+};
+
+SPLAT_INLINE void open_four(const PatchJob& job, const Window& window, const int (&number)[kFour], Four* four) {
+    for (int i = 0; i < kFour; ++i) {
+        four->view[i] = number[i] < job.view_count ? job.views + number[i] : nullptr;
+        const PatchView& view = job.views[four->view[i] ? number[i] : 0];
+        for (int k = 0; k < 3; ++k) {
+            four->right[k][i] = view.turn[3 * k], four->down[k][i] = view.turn[3 * k + 1];
+            four->at[k][i] = view.turn[3 * k + 2], four->shift[k][i] = view.shift[k];
+        }
     }
-    if (!(at[2] > kNearest)) return kPatchWorst;
-    const float width = static_cast<float>(view.width), height = static_cast<float>(view.height);
-    const float middle_x = at[0] / at[2], middle_y = at[1] / at[2];
-    const bool is_in = middle_x > 1.0f && middle_y > 1.0f && middle_x < width - 1.0f && middle_y < height - 1.0f;
-    if (!is_in || !view.counts[static_cast<int64_t>(middle_y) * view.width + static_cast<int64_t>(middle_x)])
-        return kPatchWorst;
-    Floats mean = fill(0.0f), square = fill(0.0f), together = fill(0.0f), unused = fill(0.0f);
+    for (int k = 0; k < 3; ++k) four->at[k] += four->right[k] * window.x + four->down[k] * window.y;
+}
+
+// Sums over a photo's samples: of its values, their squares, and their products with the window's values.
+struct Sums {
+    Floats mean, square, together;
+};
+
+SPLAT_INLINE Sums sampled(const PatchView& view, const Window& window, const float (&at)[3], const float (&right)[3],
+                          const float (&down)[3]) {
+    Sums sums{fill(0.0f), fill(0.0f), fill(0.0f)};
+    const Floats last_x = fill(static_cast<float>(view.width) - 1.0f);
+    const Floats last_y = fill(static_cast<float>(view.height) - 1.0f);
     for (int k = 0; k < kSamples; k += kLanes) {
         const Floats dx = load(kRight + k), dy = load(kDown + k);
         const Floats scale = inverse(max(fma(fill(right[2]), dx, fma(fill(down[2]), dy, fill(at[2]))), fill(kNearest)));
         Floats x = fma(fma(fill(right[0]), dx, fma(fill(down[0]), dy, fill(at[0]))), scale, fill(-0.5f));
         Floats y = fma(fma(fill(right[1]), dx, fma(fill(down[1]), dy, fill(at[1]))), scale, fill(-0.5f));
-        x = clamp(x, fill(0.0f), fill(width - 1.0f)), y = clamp(y, fill(0.0f), fill(height - 1.0f));
+        x = clamp(x, fill(0.0f), last_x), y = clamp(y, fill(0.0f), last_y);
         const Floats left = floor(x), above = floor(y);
         Floats corner[4];
         gather_bytes(view.corners, left, above, view.width, corner);
@@ -130,54 +146,84 @@ float view_cost(const PatchView& view, const Window& window, const Plane& plane)
         const Floats top = fma(part_x, corner[1] - corner[0], corner[0]);
         const Floats bottom = fma(part_x, corner[3] - corner[2], corner[2]);
         const Floats value = fma(part_y, bottom - top, top), weighted = load(window.weights + k) * value;
-        mean = mean + weighted, square = fma(weighted, value, square);
-        together = fma(load(window.centred + k), value, together);
+        sums.mean = sums.mean + weighted, sums.square = fma(weighted, value, sums.square);
+        sums.together = fma(load(window.centred + k), value, sums.together);
     }
-    float sums[4];
-    sum_lanes(mean, square, together, unused, sums);
-    const float variance = sums[1] - sums[0] * sums[0];
-    const float product = ((variance > 0.0f ? variance : 0.0f) + kNoise2) * (window.variance + kNoise2);
-    return 1.0f - sums[2] / __builtin_sqrtf(product);
+    return sums;
+}
+
+// One minus the correlation, or kPatchWorst where a photo does not show the pixel.
+Fours view_costs(const Four& four, const Window& window, const Plane& plane) {
+    Fours at[3], right[3], down[3];
+    for (int k = 0; k < 3; ++k) {
+        at[k] = four.at[k] + four.shift[k] * plane.inverse;
+        right[k] = four.right[k] + four.shift[k] * plane.across;
+        down[k] = four.down[k] + four.shift[k] * plane.down;
+    }
+    const Fours middle_x = at[0] / at[2], middle_y = at[1] / at[2];
+    Sums sums[kFour];
+    Fours costs;
+    for (int i = 0; i < kFour; ++i) {
+        sums[i] = {fill(0.0f), fill(0.0f), fill(0.0f)};
+        costs[i] = kPatchWorst;
+        if (!four.view[i] || !(at[2][i] > kNearest)) continue;
+        const PatchView& view = *four.view[i];
+        const float x = middle_x[i], y = middle_y[i];
+        const float width = static_cast<float>(view.width), height = static_cast<float>(view.height);
+        if (!(x > 1.0f && y > 1.0f && x < width - 1.0f && y < height - 1.0f)) continue;
+        if (!view.counts[static_cast<int64_t>(y) * view.width + static_cast<int64_t>(x)]) continue;
+        sums[i] = sampled(view, window, {at[0][i], at[1][i], at[2][i]}, {right[0][i], right[1][i], right[2][i]},
+                          {down[0][i], down[1][i], down[2][i]});
+        costs[i] = 1.0f;
+    }
+    float mean[kFour], square[kFour], together[kFour];
+    sum_lanes(sums[0].mean, sums[1].mean, sums[2].mean, sums[3].mean, mean);
+    sum_lanes(sums[0].square, sums[1].square, sums[2].square, sums[3].square, square);
+    sum_lanes(sums[0].together, sums[1].together, sums[2].together, sums[3].together, together);
+    for (int i = 0; i < kFour; ++i) {
+        const float variance = square[i] - mean[i] * mean[i];
+        const float product = ((variance > 0.0f ? variance : 0.0f) + kNoise2) * (window.variance + kNoise2);
+        costs[i] -= together[i] / __builtin_sqrtf(product);
+    }
+    return costs;
+}
+
+// Mean of the lowest two costs, each at most kUnlike.
+SPLAT_INLINE float best_of(Fours costs) {
+    costs = at_most(costs, kUnlike);
+    const float a = costs[0] < costs[1] ? costs[0] : costs[1], b = costs[0] < costs[1] ? costs[1] : costs[0];
+    const float c = costs[2] < costs[3] ? costs[2] : costs[3], d = costs[2] < costs[3] ? costs[3] : costs[2];
+    const float middle = a < c ? c : a, other = b < d ? b : d;
+    return 0.5f * ((a < c ? a : c) + (middle < other ? middle : other));
 }
 
 // The photos that a pixel is compared with, the most similar ones for its plane, as bytes of an integer; 255: none.
 SPLAT_INLINE int chosen_view(uint32_t chosen, int k) { return static_cast<int>(chosen >> (8 * k) & 255U); }
 
-float plane_cost(const PatchJob& job, const Window& window, const Plane& plane, uint32_t chosen) {
-    if (!(plane.inverse >= job.least && plane.inverse <= job.most)) return kPatchWorst;
-    float best[kBest + 1];
-    for (float& each : best) each = kUnlike;
-    for (int k = 0; k < kLooked; ++k) {
-        const int view = chosen_view(chosen, k);
-        if (view == kNoView) break;
-        const float cost = view_cost(job.views[view], window, plane);
-        int place = kBest;
-        for (; place > 0 && best[place - 1] > cost; --place) best[place] = best[place - 1];
-        best[place] = cost;
-    }
-    float sum = 0.0f;
-    for (int k = 0; k < kBest; ++k) sum += best[k];
-    return sum * (1.0f / kBest);
-}
-
-// The photos to compare with; the plane's cost in them is that of `plane_cost`, which is not computed twice.
+// The photos to compare with; the plane's cost in them is not computed twice.
 uint32_t choose(const PatchJob& job, const Window& window, const Plane& plane, float* cost) {
-    float costs[kLooked + 1];
-    int views[kLooked + 1], count = 0;
-    for (int k = 0; k < job.view_count; ++k) {
-        const float found = view_cost(job.views[k], window, plane);
-        int place = least_of(count, kLooked - 1);
-        if (count == kLooked && costs[place] <= found) continue;
-        for (; place > 0 && costs[place - 1] > found; --place)
-            costs[place] = costs[place - 1], views[place] = views[place - 1];
-        costs[place] = found, views[place] = k;
-        count = least_of(count + 1, kLooked);
+    float costs[kFour + 1];
+    int views[kFour + 1], count = 0;
+    for (int first = 0; first < job.view_count; first += kFour) {
+        Four four;
+        open_four(job, window, {first, first + 1, first + 2, first + 3}, &four);
+        const Fours found = view_costs(four, window, plane);
+        for (int i = 0; i < least_of(kFour, job.view_count - first); ++i) {
+            int place = least_of(count, kFour - 1);
+            if (count == kFour && costs[place] <= found[i]) continue;
+            for (; place > 0 && costs[place - 1] > found[i]; --place)
+                costs[place] = costs[place - 1], views[place] = views[place - 1];
+            costs[place] = found[i], views[place] = first + i;
+            count = least_of(count + 1, kFour);
+        }
     }
-    float sum = 0.0f;
-    for (int k = 0; k < kBest; ++k) sum += k < count && costs[k] < kUnlike ? costs[k] : kUnlike;
-    *cost = sum * (1.0f / kBest);
+    Fours best;
     uint32_t chosen = 0;
-    for (int k = 0; k < kLooked; ++k) chosen |= static_cast<uint32_t>(k < count ? views[k] : kNoView) << (8 * k);
+    for (int k = 0; k < kFour; ++k) {
+        best[k] = k < count ? costs[k] : kUnlike;
+        chosen |= static_cast<uint32_t>(k < count ? views[k] : kNoView) << (8 * k);
+    }
+    *cost = best_of(best);
     return chosen;
 }
 
@@ -185,12 +231,13 @@ uint32_t choose(const PatchJob& job, const Window& window, const Plane& plane, f
 struct Pixel {
     const PatchJob& job;
     const Window& window;
-    uint32_t chosen;  // the photos in which planes are tried
+    const Four& four;  // the photos in which planes are tried
     Plane plane;
     float cost;
 
     SPLAT_METHOD void attempt(const Plane& other) {
-        const float found = plane_cost(job, window, other, chosen);
+        if (!(other.inverse >= job.least && other.inverse <= job.most)) return;
+        const float found = best_of(view_costs(four, window, other));
         if (found < cost) cost = found, plane = other;
     }
     // The plane of another pixel, evaluated here; -1: none.
@@ -281,7 +328,11 @@ void improve(const PatchJob& job, int row, int colour, int iteration) {
         const Plane plane{job.planes[at], job.planes[size + at], job.planes[2 * size + at]};
         float cost = job.costs[at];
         const uint32_t chosen = iteration ? choose(job, window, plane, &cost) : job.chosen[at];
-        Pixel pixel{job, window, chosen, plane, job.costs[at]};
+        Four four;
+        open_four(job, window,
+                  {chosen_view(chosen, 0), chosen_view(chosen, 1), chosen_view(chosen, 2), chosen_view(chosen, 3)},
+                  &four);
+        Pixel pixel{job, window, four, plane, job.costs[at]};
         take_from_neighbours(job, column, row, &pixel);
         Draws draws{mixed(job.seed + 1U + static_cast<uint32_t>(iteration)) ^ mixed(static_cast<uint32_t>(at))};
         change_a_little(job, iteration, &draws, &pixel);
