@@ -102,7 +102,7 @@ void open_window(const PatchJob& job, int column, int row, Window* window) {
 constexpr int kFour = 4;
 using Fours = float __attribute__((vector_size(4 * kFour)));
 
-SPLAT_INLINE Fours at_most(Fours a, float b) { return a < b ? a : Fours{} + b; }
+SPLAT_INLINE Fours capped(Fours a, float most) { return a < most ? a : Fours{} + most; }
 
 // Four photos as a pixel sees them: a plane (inverse, across, down) at the pixel's centre carries it to at + shift
 // inverse, and a step to the right changes that by right + shift across, one down by down + shift down.
@@ -190,7 +190,7 @@ Fours view_costs(const Four& four, const Window& window, const Plane& plane) {
 
 // Mean of the lowest two costs, each at most kUnlike.
 SPLAT_INLINE float best_of(Fours costs) {
-    costs = at_most(costs, kUnlike);
+    costs = capped(costs, kUnlike);
     const float a = costs[0] < costs[1] ? costs[0] : costs[1], b = costs[0] < costs[1] ? costs[1] : costs[0];
     const float c = costs[2] < costs[3] ? costs[2] : costs[3], d = costs[2] < costs[3] ? costs[3] : costs[2];
     const float middle = a < c ? c : a, other = b < d ? b : d;
