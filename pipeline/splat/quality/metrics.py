@@ -316,7 +316,9 @@ def _square_error(x: Picture, y: Picture) -> float:
 def _window_sums(x: Picture, y: Picture, counts: Counts) -> WindowSums:
     """Compare the windows around all pixels, a strip at a time."""
     radius, height = SSIM_WINDOW // 2, counts.shape[0]
-    blurred = [_blur(image) for image in (x, y, x * y, cv2.add(x * x, y * y))]
+    apart, squares = x - y, x * x
+    squares += y * y
+    blurred = [_blur(image) for image in (x, y, np.multiply(apart, apart, out=apart), squares)]
     whole = np.zeros_like(counts)
     whole[radius:-radius, radius:-radius] = counts[radius:-radius, radius:-radius]
     around, inner, factor = [], [], []
@@ -342,14 +344,19 @@ def _blur(image: Picture) -> Picture:
     return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101))
 
 
-def _similarity(mx: Picture, my: Picture, of_product: Picture, of_squares: Picture) -> tuple[Picture, Picture]:
-    """SSIM and its contrast · structure factor from the windows' means of x, y, x y and x² + y²."""
-    product, squares = mx * my, mx * mx
+def _similarity(mx: Picture, my: Picture, of_difference: Picture, of_squares: Picture) -> tuple[Picture, Picture]:
+    """SSIM and its contrast · structure factor from the windows' means of x, y, (x - y)² and x² + y².
+
+    The covariance comes from the variance of the difference, 2 σxy = σx² + σy² - σ(x-y)², because in float32 the mean
+    of x y less the product of the means would lose 1e-7, which is much where σ² is less than C2.
+    """
+    product, squares, apart = mx * my, mx * mx, mx - my
     squares += my * my
-    up, down = of_product - product, of_squares - squares
-    up *= 2.0
-    up += SSIM_C2
+    apart *= apart
+    down = of_squares - squares
     down += SSIM_C2
+    up = down - of_difference
+    up += apart
     structure = up / down
     product *= 2.0
     product += SSIM_C1
