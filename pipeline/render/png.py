@@ -30,7 +30,7 @@ def coded_png(
     height, width = pixels.shape[:2]
     colour = RGB if pixels.ndim == 3 else GREY if palette is None else PALETTE
     deflate = zlib.compressobj(LEVEL, zlib.DEFLATED, WINDOW_BITS, MEMORY_LEVEL, zlib.Z_RLE)
-    data = deflate.compress(_filtered(pixels)) + deflate.flush()
+    data = deflate.compress(_filtered(pixels).data) + deflate.flush()
     parts = [SIGNATURE, _chunk(b"IHDR", struct.pack(">2I5B", width, height, 8, colour, 0, 0, 0))]
     if palette is not None:
         parts.append(_chunk(b"PLTE", palette.tobytes()))

@@ -328,8 +328,10 @@ def _window_sums(x: Picture, y: Picture, counts: Counts) -> WindowSums:
         around.append(_sums(similarity, counts[rows]))
         inner.append(_sums(similarity, whole[rows]))
         factor.append(_sums(structure, whole[rows]))
-    sums = (tuple(math.fsum(channel) for channel in zip(*each, strict=True)) for each in (around, inner, factor))
-    return WindowSums(*sums, inner=int(np.count_nonzero(whole)))
+    of_around, of_inner, of_factor = (
+        tuple(math.fsum(channel) for channel in zip(*each, strict=True)) for each in (around, inner, factor)
+    )
+    return WindowSums(of_around, of_inner, of_factor, int(np.count_nonzero(whole)))
 
 
 def _sums(values: Picture, counts: Counts) -> tuple[float, ...]:
@@ -391,7 +393,6 @@ def _square_gradient(image: Grey, across: tuple[float, float, float], border: in
     along, smooth = np.array([-1.0, 0.0, 1.0]), np.array(across) / sum(across)
     dx = np.asarray(cv2.sepFilter2D(image, -1, along, smooth, borderType=border))
     dy = np.asarray(cv2.sepFilter2D(image, -1, smooth, along, borderType=border))
-    dx *= dx
-    dy *= dy
-    dx += dy
-    return dx
+    np.multiply(dx, dx, out=dx)
+    np.multiply(dy, dy, out=dy)
+    return np.asarray(np.add(dx, dy, out=dx))
