@@ -189,7 +189,7 @@ CLEAN = Stage(
 )
 EVALUATE = Stage(
     "evaluate",
-    version=12,
+    version=13,
     config=EvaluateConfig,
     reads=(
         "clean.model",

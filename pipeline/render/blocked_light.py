@@ -99,6 +99,7 @@ def blocked_shares(
     reach += spread_along(gaussians, np.arange(len(gaussians)), camera.cam_from_world[2, :3])
     stopped = np.zeros(len(depths))
     options = replace(options, sh_degree=0, depth=False)  # only alpha is used
+    gaussians = replace(gaussians, sh=gaussians.sh[:, :1])  # most of what would be copied
     for part in np.array_split(np.arange(len(depths)), SLICES):
         before = np.flatnonzero(reach < (1.0 - MARGIN) * depths[part[0]]) if len(part) else part
         if len(before):

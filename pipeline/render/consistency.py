@@ -56,13 +56,14 @@ def neighbouring_pairs(seen: Sequence[Int64[np.ndarray, " _"]], most: int = MAX_
     usable = [index for index, rows in enumerate(seen) if rows.size]
     if len(usable) < 2 or most < 1:
         return []
-    points = 1 + max(int(seen[index].max()) for index in usable)
+    once = {index: np.unique(seen[index]) for index in usable}
+    points = 1 + max(int(rows[-1]) for rows in once.values())
     pairs = set()
     for place in np.unique(np.linspace(0, len(usable) - 1, min(most, len(usable))).round().astype(int)):
         here = usable[place]
         marked = np.zeros(points, np.bool_)
-        marked[seen[here]] = True
-        shared = [0 if index == here else int(marked[np.unique(seen[index])].sum()) for index in usable]
+        marked[once[here]] = True
+        shared = [0 if index == here else int(np.count_nonzero(marked[rows])) for index, rows in once.items()]
         best = int(np.argmax(shared))
         if shared[best] > 0:
             pairs.add((min(here, usable[best]), max(here, usable[best])))

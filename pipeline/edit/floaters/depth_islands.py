@@ -36,14 +36,15 @@ def without_islands(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h
     return least
 
 
-def _lines(length: int) -> list[UInt8[np.ndarray, "k k"]]:
-    """Structuring elements: segments through the centre of a square, one pixel wide, in ``DIRECTIONS`` directions."""
-    side = length | 1
+def _lines(length: int) -> list[UInt8[np.ndarray, "_ _"]]:
+    """Structuring elements: segments through a rectangle's centre, one pixel wide, in ``DIRECTIONS`` directions."""
+    half = (length | 1) // 2
     lines = []
     for turn in range(DIRECTIONS):
-        angle, half = math.pi * turn / DIRECTIONS, side // 2
+        angle = math.pi * turn / DIRECTIONS
         right, down = round(half * math.cos(angle)), round(half * math.sin(angle))
-        line = np.zeros((side, side), np.uint8)
-        cv2.line(line, (half - right, half - down), (half + right, half + down), 1)
+        line = np.zeros((2 * abs(down) + 1, 2 * abs(right) + 1), np.uint8)  # no larger: OpenCV is fast for a column
+        middle_x, middle_y = abs(right), abs(down)
+        cv2.line(line, (middle_x - right, middle_y - down), (middle_x + right, middle_y + down), 1)
         lines.append(line)
     return lines

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
@@ -22,12 +23,14 @@ from splatpipe.pipeline.edit.floaters.visibility import TrainingPhotos
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.pulled_back import pulled_back
+from splatpipe.pipeline.raster.sky import SkyLayer, laid_over_nodes
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
-from splatpipe.pipeline.splat.sky.panorama import composite_over
 
 Picture = Float32[np.ndarray, "h w 3"]
 FITTED_PIXELS = 4  # the colour map is fitted to every fourth pixel in both directions
 HALFWAY = 0.5
+LEVELS = np.arange(256, dtype=np.float32) / np.float32(255.0)  # of 8 bits, as renders have them
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +76,7 @@ def error_change_in_photos(
     for done, index in enumerate(photos.compared_photos, start=1):
         colour = _rendered(halfway, photos.cameras[index], photos, options)
         downhill = _error_slope(colour, *photos.picture(index))
-        (slope,) = torch.autograd.grad(colour, logits, downhill)
-        paid = slope.numpy(force=True) * per_logit
+        paid = pulled_back(colour, downhill, logits).numpy(force=True) * per_logit
         better -= np.minimum(paid, 0.0)
         worse += np.maximum(paid, 0.0)
         on_progress(done)
@@ -85,19 +87,21 @@ def _rendered(model: Gaussians, camera: Camera, photos: TrainingPhotos, options:
     rendered = rasterizer.render(model, camera, options)
     if photos.sky is None:
         return rendered.colour
-    behind = photos.sky.behind(camera, options.background)
-    return composite_over(rendered.colour, rendered.alpha, options.background, behind)
+    nodes = photos.sky.view_from(camera).at_nodes(photos.sky.colours, options.background)
+    return laid_over_nodes(rendered.colour, rendered.alpha, nodes, SkyLayer(options.background))
 
 
 def _error_slope(colour: Tensor, photo: Pixels, mask: Mask | None) -> Tensor:
     """Gradient of a render's squared error with respect to its pixels; 0 where the photo is masked."""
     picture = np.asarray(colour.detach().clamp(0.0, 1.0).numpy(force=True))
-    target = photo.astype(np.float32) / np.float32(255.0)
+    target = np.asarray(cv2.LUT(photo, LEVELS))
     colours = _colour_map(picture, target, mask)
-    error = (picture @ colours[:3] + colours[3]).clip(0.0, 1.0) - target
+    error = np.asarray(cv2.transform(picture, colours.T))
+    np.clip(error, 0.0, 1.0, out=error)
+    error -= target
     if mask is not None:
         error[~mask] = 0.0
-    return torch.from_numpy((2.0 * error @ colours[:3].T).astype(np.float32)).to(colour)
+    return torch.from_numpy(np.asarray(cv2.transform(error, 2.0 * colours[:3]))).to(colour)
 
 
 def _colour_map(picture: Picture, target: Picture, mask: Mask | None) -> Float64[np.ndarray, "4 3"]:

@@ -22,6 +22,7 @@ from splatpipe.pipeline.edit.floaters.isolation import half_axes
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
 from splatpipe.pipeline.raster import rasterizer
+from splatpipe.pipeline.raster.pulled_back import pulled_back
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.model.sh import C0
 from splatpipe.pipeline.splat.sky.panorama import Panorama
@@ -131,7 +132,7 @@ def weights_of(
 ) -> Float32[np.ndarray, "n 3"]:
     """Sums over a render's pixels of each Gaussian's weights α T times an image's values."""
     values = torch.from_numpy(picture).to(rendered.colour)
-    (found,) = torch.autograd.grad(rendered.colour, grey.sh, values)
+    found = pulled_back(rendered.colour, values, grey.sh)
     return np.asarray((found[:, 0] / C0).numpy(force=True))
 
 

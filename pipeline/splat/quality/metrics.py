@@ -1,8 +1,9 @@
 """Similarity metrics between a render and its photo that need no learned weights.
 
 Every metric takes images (h, w, 3) in [0, 1] and an optional mask (h, w), True where a pixel counts. Pixels that do not
-count are replaced by the photo's before any neighbourhood is evaluated, so they neither help nor harm. Everything is
-float64, and every sum has a fixed order: bit-identical for any number of threads.
+count are replaced by the photo's before any neighbourhood is evaluated, so they neither help nor harm. Pictures are
+computed in the images' own precision: float32 suffices for images of 8 bits, to a few 1e-7, in half the time. Sums over
+pixels are float64, and every one has a fixed order: bit-identical for any number of threads.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
 
 Image = Float[Tensor, "h w 3"]
 Mask = Bool[Tensor, "h w"]
+Picture = Float[np.ndarray, "h w 3"]
+Grey = Float[np.ndarray, "h w"]
+Counts = Bool[np.ndarray, "h w"]
+Fields = tuple[Float[np.ndarray, "_ _ 3"], Float[np.ndarray, "_ _ 3"]]  # the same pixels of both images
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
@@ -35,7 +39,8 @@ _LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601 luma from gamma-coded RGB, as in the authors' rgb2gray."""
 _EDGE_SHARE = 0.1
 _FIELDS = 32  # chessboard fields along an image's longer side: 51 pixels each at 2 megapixels, 19 at 0.27
-_STRIP_ROWS = 64  # rows whose windows are compared at a time: they fit into a core's cache
+_STRIP_ROWS = 16  # rows whose windows are compared at a time: a handful of pictures of them fit into a core's cache
+NO_PIXEL = "the mask leaves no pixel to measure"
 _SHARPNESS_FLOOR = 1.0 / 255.0
 """A gradient of one grey level per pixel: a photo with less has no edges to compare."""
 
@@ -45,33 +50,46 @@ class ImagePair:
     """A render and its photo, prepared once for every metric.
 
     Attributes:
-        x: The render's channels; pixels that do not count are the photo's.
-        y: The photo's channels.
+        x: The render; pixels that do not count are the photo's.
+        y: The photo, of the same precision.
         counts: Which pixels count.
     """
 
-    x: Float[Tensor, "3 h w"]
-    y: Float[Tensor, "3 h w"]
-    counts: Bool[Tensor, "h w"]
+    x: Picture
+    y: Picture
+    counts: Counts
 
     @cached_property
-    def lumas(self) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    def counted(self) -> int:
+        """Number of pixels that count."""
+        return int(np.count_nonzero(self.counts))
+
+    @cached_property
+    def lumas(self) -> tuple[Grey, Grey]:
         """Both images' luma."""
         return _luma(self.x), _luma(self.y)
 
     @cached_property
-    def windows(self) -> list[list[float]]:
-        """For each channel: the sum of SSIM over all counting pixels with the borders reflected; and the sums of SSIM
-        and of its contrast · structure factor over the whole windows, as the finest scale of MS-SSIM needs them."""
-        radius = SSIM_WINDOW // 2
-        whole = self.counts.clone()
-        for border in (whole[:radius], whole[-radius:], whole[:, :radius], whole[:, -radius:]):
-            border.zero_()
-        sums = []
-        for channel in zip(self.x, self.y, strict=True):
-            around_x, around_y = (pad(image[None], [radius] * 4, mode="reflect")[0] for image in channel)
-            sums.append(_window_sums(around_x, around_y, (self.counts, whole, whole)))
-        return sums
+    def windows(self) -> WindowSums:
+        """The comparison of all windows, the borders reflected, at full size: what SSIM and MS-SSIM share."""
+        return _window_sums(self.x, self.y, self.counts)
+
+
+@dataclass(frozen=True)
+class WindowSums:
+    """Sums over windows, (red, green, blue) each.
+
+    Attributes:
+        around: SSIM over all counting centres, the images' borders reflected.
+        similarity: SSIM over the counting centres whose windows lie in the image.
+        structure: The contrast · structure factor over the same.
+        inner: Number of the latter.
+    """
+
+    around: tuple[float, ...]
+    similarity: tuple[float, ...]
+    structure: tuple[float, ...]
+    inner: int
 
 
 def pair_of(render: Image, photo: Image, mask: Mask | None = None) -> ImagePair:
@@ -82,18 +100,16 @@ def pair_of(render: Image, photo: Image, mask: Mask | None = None) -> ImagePair:
     """
     if render.shape != photo.shape or render.ndim != 3 or render.shape[2] != 3:
         raise ValueError(f"render {tuple(render.shape)} and photo {tuple(photo.shape)} are not both (h, w, 3)")
-    counts = torch.ones(render.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
+    counts = np.ones(render.shape[:2], np.bool_) if mask is None else mask.numpy(force=True)
     if counts.shape != render.shape[:2]:
         raise ValueError(f"mask {tuple(counts.shape)} is not {tuple(render.shape[:2])}")
     _require_pixels(counts)
-    if not bool(torch.isfinite(photo).all() and (torch.isfinite(render).all() if mask is None else True)):
-        raise ValueError("the render or the photo has values that are not finite")
-    x, y = (_planes(image.detach().cpu()) for image in (render, photo))
+    precision = np.float32 if render.dtype == photo.dtype == torch.float32 else np.float64
+    x, y = (np.ascontiguousarray(image.numpy(force=True), precision) for image in (render, photo))
     if mask is not None:
-        for channel, other in zip(x, y, strict=True):
-            channel.copy_(torch.where(counts, channel, other))
-            if not bool(torch.isfinite(channel).all()):
-                raise ValueError("the render or the photo has values that are not finite")
+        x = np.where(counts[:, :, None], x, y)
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise ValueError("the render or the photo has values that are not finite")
     return ImagePair(x, y, counts)
 
 
@@ -117,9 +133,7 @@ def psnr(pair: ImagePair) -> float:
     Raises:
         ValueError: if the shapes differ, a value is not finite, or no pixel counts (likewise for every metric here).
     """
-    x, y, counts = pair.x, pair.y, pair.counts
-    errors = (_sum((a - b).square_(), counts) for a, b in zip(x, y, strict=True))
-    error = math.fsum(errors) / (3 * int(counts.sum()))
+    error = _square_error(pair.x, pair.y) / (3 * pair.counted)  # 0 where pixels do not count
     return 10.0 * math.log10(1.0 / error) if error > 0.0 else math.inf
 
 
@@ -137,47 +151,47 @@ def psnr_cc(pair: ImagePair) -> float:
     Raises:
         ValueError: also if one half has no pixel that counts.
     """
-    x, y, counts = pair.x, pair.y, pair.counts
-    board = _chessboard(counts.shape[0], counts.shape[1])
-    halves = (counts & board, counts & ~board)
-    maps = _colour_maps(x, y, halves)
+    halves = tuple(list(_fields(pair, half)) for half in (0, 1))
+    maps = [_colour_map(half) for half in halves]
     errors = []
     for colour, scored in zip(reversed(maps), halves, strict=True):
-        for source, target in _chosen_strips(x, y, scored):
-            for channel, into in zip(target, colour.T.tolist(), strict=True):
-                corrected = into[0] * source[0] + into[1] * source[1] + into[2] * source[2] + into[3]
-                errors.append(float((corrected.clamp_(0.0, 1.0) - channel).square_()[None].sum(dim=1)))
-    error = math.fsum(errors) / (3 * int(counts.sum()))
+        for source, target in scored:
+            corrected = np.asarray(cv2.transform(source, colour.T))
+            errors.append(_square_error(np.clip(corrected, 0.0, 1.0, out=corrected), target))
+    error = math.fsum(errors) / (3 * pair.counted)
     return 10.0 * math.log10(1.0 / error) if error > 0.0 else math.inf
 
 
-def _chessboard(height: int, width: int) -> Bool[Tensor, "h w"]:
+def _fields(pair: ImagePair, half: int) -> Iterator[Fields]:
+    """The counting pixels of both images on the chessboard's fields of one colour, a row of fields at a time."""
+    height, width = pair.counts.shape
     side = math.ceil(max(height, width) / _FIELDS)
-    rows, columns = (torch.arange(size) // side for size in (height, width))
-    return (rows[:, None] + columns[None]) % 2 == 0
+    colour = np.arange(width) // side % 2
+    for row, top in enumerate(range(0, height, side)):
+        rows, columns = slice(top, top + side), colour == (row + half) % 2
+        source, target, counts = (image[rows].compress(columns, axis=1) for image in (pair.x, pair.y, pair.counts))
+        if not counts.all():
+            source, target = source[counts][None], target[counts][None]
+        if source.size:
+            yield source, target
 
 
-def _colour_maps(x: Tensor, y: Tensor, halves: tuple[Tensor, Tensor]) -> list[Float[Tensor, "4 3"]]:
-    """The least-squares map from ``x`` to ``y`` for each half; the last row is the offset."""
-    solutions = []
-    for half in halves:
-        _require_pixels(half)
-        sums = torch.zeros(4, 7, dtype=torch.float64)  # products of (x, 1) with (x, 1, y), summed
-        for source, target in _chosen_strips(x, y, half):
-            every = torch.cat([source, torch.ones_like(source[:1]), target])  # (7, n)
-            sums += torch.stack([(one * every).sum(dim=1) for one in every[:4]])
-        # gelsd returns the minimum-norm solution: a render of one colour leaves the map undetermined
-        solutions.append(torch.linalg.lstsq(sums[:, :4], sums[:, 4:], driver="gelsd").solution)
-    return solutions
+def _colour_map(half: Sequence[Fields]) -> Float64[np.ndarray, "4 3"]:
+    """The least-squares map from the first images to the second ones; the last row is the offset.
 
-
-def _chosen_strips(x: Tensor, y: Tensor, chosen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """The chosen pixels (3, n) of both images, strip by strip."""
-    for top in range(0, chosen.shape[0], _STRIP_ROWS):
-        rows = slice(top, top + _STRIP_ROWS)
-        places = torch.nonzero(chosen[rows].reshape(-1))[:, 0]
-        source, target = (image[:, rows].reshape(3, -1).index_select(1, places) for image in (x, y))
-        yield source, target
+    Raises:
+        ValueError: if there is no pixel.
+    """
+    if not half:
+        raise ValueError(NO_PIXEL)
+    sums = np.zeros((4, 7))  # products of (x, 1) with (x, 1, y), summed
+    for source, target in half:
+        every = np.ones((7, source.shape[0] * source.shape[1]))
+        every[:3], every[4:] = source.reshape(-1, 3).T, target.reshape(-1, 3).T
+        sums += np.einsum("in,jn->ij", every[:4], every)  # in one thread, in a fixed order
+    # gelsd returns the minimum-norm solution: a render of one colour leaves the map undetermined
+    normal, wanted = torch.from_numpy(sums[:, :4].copy()), torch.from_numpy(sums[:, 4:].copy())
+    return np.asarray(torch.linalg.lstsq(normal, wanted, driver="gelsd").solution.numpy())
 
 
 @Metric
@@ -193,7 +207,7 @@ def ssim(pair: ImagePair) -> float:
     radius = SSIM_WINDOW // 2
     if min(pair.counts.shape) <= radius:
         raise ValueError(f"SSIM needs images of {radius + 1} pixels a side, got {tuple(pair.counts.shape)}")
-    return math.fsum(sums[0] for sums in pair.windows) / (3 * int(pair.counts.sum()))
+    return math.fsum(pair.windows.around) / (3 * pair.counted)
 
 
 @Metric
@@ -212,17 +226,12 @@ def ms_ssim(pair: ImagePair) -> float:
     radius = SSIM_WINDOW // 2
     scales: list[tuple[list[float], list[float]]] = []  # (similarity, contrast · structure) of each channel
     for _ in _MS_SSIM_WEIGHTS:
-        inner = counts[radius:-radius, radius:-radius]
-        if min(x.shape[1:]) < SSIM_WINDOW or not bool(inner.any()):
+        if min(counts.shape) < SSIM_WINDOW or not counts[radius:-radius, radius:-radius].any():
             break
-        if not scales:
-            sums = [channel[1:] for channel in pair.windows]
-        else:
-            sums = [_window_sums(*channel, (inner, inner)) for channel in zip(x, y, strict=True)]
-        similarity, structure = ([total[k] / int(inner.sum()) for total in sums] for k in (0, 1))
+        sums = _window_sums(x, y, counts) if scales else pair.windows
+        similarity, structure = ([total / sums.inner for total in part] for part in (sums.similarity, sums.structure))
         scales.append((similarity, structure))
-        x, y = avg_pool2d(x, 2), avg_pool2d(y, 2)
-        counts = _halved(counts)
+        x, y, counts = _half_size(x), _half_size(y), _halved(counts)
     if not scales:
         raise ValueError(f"MS-SSIM needs a window of {SSIM_WINDOW} pixels a side to fit")
     weights = _MS_SSIM_WEIGHTS[: len(scales)]
@@ -249,10 +258,9 @@ def gmsd(pair: ImagePair) -> float:
         raise ValueError(f"GMSD needs images of 2 pixels a side, got {tuple(pair.counts.shape)}")
     counts = _halved(pair.counts)
     _require_pixels(counts)
-    gx, gy = (_gradient(avg_pool2d(luma[None], 2)[0], (1.0, 1.0, 1.0)) for luma in pair.lumas)
-    similarity = (2.0 * gx * gy + _GMSD_C) / (gx.square() + gy.square() + _GMSD_C)
-    mean = _mean(similarity[None], counts)
-    return math.sqrt(_mean((similarity - mean).square()[None], counts))
+    gx, gy = (np.sqrt(_square_gradient(_half_size(luma), (1.0, 1.0, 1.0), cv2.BORDER_CONSTANT)) for luma in pair.lumas)
+    similarity = (2.0 * gx * gy + _GMSD_C) / (gx * gx + gy * gy + _GMSD_C)
+    return float(cv2.meanStdDev(similarity, mask=_as_mask(counts))[1].item())
 
 
 @Metric
@@ -262,13 +270,13 @@ def sharpness(pair: ImagePair) -> float:
     The ratio of the RMS Sobel gradients (Tenengrad: Krotkov, Focusing, IJCV 1, 1987) of the luma, over the tenth of the
     counting pixels where the photo's gradient is largest.
     """
-    gx, gy = (_gradient(pad(luma[None], [1] * 4, mode="replicate")[0], (1.0, 2.0, 1.0)) for luma in pair.lumas)
-    gx, gy = (gradient[1:-1, 1:-1].masked_select(pair.counts) for gradient in (gx, gy))  # (pixels,)
-    edges = max(1, math.ceil(_EDGE_SHARE * gy.numel()))
-    least = float(np.partition(gy.numpy(), gy.numel() - edges)[gy.numel() - edges])
-    above, level = torch.nonzero(gy > least)[:, 0], torch.nonzero(gy == least)[:, 0]
-    chosen = torch.cat([above, level[: edges - above.numel()]])  # among equal ones, the first
-    rms = [math.sqrt(math.fsum(g[chosen].square().tolist()) / edges) for g in (gx, gy)]
+    gx, gy = (_square_gradient(luma, (1.0, 2.0, 1.0), cv2.BORDER_REPLICATE) for luma in pair.lumas)
+    gx, gy = (gradient[pair.counts] for gradient in (gx, gy))  # (pixels,)
+    edges = max(1, math.ceil(_EDGE_SHARE * gy.size))
+    least = np.partition(gy, gy.size - edges)[gy.size - edges]
+    above, level = np.flatnonzero(gy > least), np.flatnonzero(gy == least)
+    chosen = np.concatenate([above, level[: edges - above.size]])  # among equal ones, the first
+    rms = [math.sqrt(gradient[chosen].sum(dtype=np.float64) / edges) for gradient in (gx, gy)]
     return (rms[0] + _SHARPNESS_FLOOR) / (rms[1] + _SHARPNESS_FLOOR)
 
 
@@ -283,87 +291,108 @@ METRICS: dict[str, Metric] = {
 """Every metric by its name in metrics.json."""
 
 
-def _ssim_window() -> Float[Tensor, " 11"]:
+def _ssim_window() -> Float64[np.ndarray, " 11"]:
     """The taps of SSIM's Gaussian window, which sum to one."""
-    offset = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    taps = torch.exp(-0.5 * (offset / SSIM_SIGMA).square())
-    return taps / taps.sum()
+    offset = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    taps = np.exp(-0.5 * (offset / SSIM_SIGMA) ** 2)
+    return np.asarray(taps / taps.sum())
 
 
-def _planes(image: Tensor) -> Float[Tensor, "3 h w"]:
-    """The channels as float64 planes, converted one at a time, because large images take much memory in float64."""
-    planes = torch.empty((3, *image.shape[:2]), dtype=torch.float64)
-    for plane, channel in zip(planes, image.unbind(2), strict=True):
-        plane.copy_(channel)
-    return planes
+def _require_pixels(counts: Counts) -> None:
+    if not counts.any():
+        raise ValueError(NO_PIXEL)
 
 
-def _require_pixels(counts: Tensor) -> None:
-    if not bool(counts.any()):
-        raise ValueError("the mask leaves no pixel to measure")
+def _as_mask(counts: Counts) -> UInt8[np.ndarray, "h w"] | None:
+    """The pixels that count as OpenCV takes them, whose functions are faster where none is left out."""
+    return None if counts.all() else np.ascontiguousarray(counts).view(np.uint8)
 
 
-def _sum(values: Float[Tensor, "h w"], counts: Bool[Tensor, "h w"]) -> float:
-    """Sum over counting pixels: torch sums a row in one thread, and fsum is exact."""
-    return math.fsum(torch.where(counts, values, 0.0).sum(dim=1).tolist())
+def _square_error(x: Picture, y: Picture) -> float:
+    """Sum of the squared differences over pixels and channels: OpenCV's is float64, in one thread."""
+    return float(cv2.norm(x, y, cv2.NORM_L2SQR)) if x.size else 0.0
 
 
-def _mean(values: Float[Tensor, "c h w"], counts: Bool[Tensor, "h w"]) -> float:
-    """Mean over channels and counting pixels."""
-    return math.fsum(_sum(channel, counts) for channel in values) / (values.shape[0] * int(counts.sum()))
+def _window_sums(x: Picture, y: Picture, counts: Counts) -> WindowSums:
+    """Compare the windows around all pixels, a strip at a time."""
+    radius, height = SSIM_WINDOW // 2, counts.shape[0]
+    apart, squares = x - y, x * x
+    squares += y * y
+    blurred = [_blur(image) for image in (x, y, np.multiply(apart, apart, out=apart), squares)]
+    whole = np.zeros_like(counts)
+    whole[radius:-radius, radius:-radius] = counts[radius:-radius, radius:-radius]
+    around, inner, factor = [], [], []
+    for top in range(0, height, _STRIP_ROWS):
+        rows = slice(top, top + _STRIP_ROWS)
+        similarity, structure = _similarity(*(image[rows] for image in blurred))
+        around.append(_sums(similarity, counts[rows]))
+        inner.append(_sums(similarity, whole[rows]))
+        factor.append(_sums(structure, whole[rows]))
+    of_around, of_inner, of_factor = (
+        tuple(math.fsum(channel) for channel in zip(*each, strict=True)) for each in (around, inner, factor)
+    )
+    return WindowSums(of_around, of_inner, of_factor, int(np.count_nonzero(whole)))
 
 
-def _window_sums(
-    x: Float[Tensor, "h w"], y: Float[Tensor, "h w"], counts: Sequence[Bool[Tensor, "h-10 w-10"]]
-) -> list[float]:
-    """Sums of SSIM, for each of the ``counts`` but the last, and of its contrast · structure factor, for the last,
-    over the whole windows whose centres count."""
-    rows: list[list[float]] = [[] for _ in counts]
-    for top in range(0, counts[0].shape[0], _STRIP_ROWS):
-        strip = slice(top, top + _STRIP_ROWS + SSIM_WINDOW - 1)
-        similarity, structure = _similarity(x[strip], y[strip])
-        values = [similarity] * (len(counts) - 1) + [structure]
-        for found, one, valid in zip(rows, values, counts, strict=True):
-            found += torch.where(valid[top : top + _STRIP_ROWS], one, 0.0).sum(dim=1).tolist()
-    return [math.fsum(found) for found in rows]
+def _sums(values: Picture, counts: Counts) -> tuple[float, ...]:
+    """Each channel's sum over counting pixels."""
+    mask, pixels = _as_mask(counts), int(np.count_nonzero(counts))
+    return tuple(pixels * mean for mean in cv2.mean(values, mask)[:3]) if pixels else (0.0, 0.0, 0.0)
 
 
-def _blur(image: Float[Tensor, "h w"]) -> Tensor:
-    """Means of whole windows (h - 10, w - 10), by OpenCV's separable filter, which runs in one thread."""
-    taps, radius = _ssim_window().numpy(), SSIM_WINDOW // 2
-    blurred = cv2.sepFilter2D(np.ascontiguousarray(image.numpy()), cv2.CV_64F, taps, taps)
-    return torch.from_numpy(np.asarray(blurred))[radius:-radius, radius:-radius]
+def _blur(image: Picture) -> Picture:
+    """Means over the windows around all pixels, the borders reflected, by OpenCV's separable filter."""
+    taps = _ssim_window()
+    return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101))
 
 
-def _similarity(x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]) -> tuple[Tensor, Tensor]:
-    """SSIM of every whole window, and its contrast · structure factor: (h - 10, w - 10) each."""
-    mx, my = _blur(x), _blur(y)
-    product = mx * my
-    squares = mx.square_().add_(my.square_())
-    up = (_blur(x * y) - product).mul_(2.0).add_(SSIM_C2)
-    down = (_blur((x * x).add_(y * y)) - squares).add_(SSIM_C2)
+def _similarity(mx: Picture, my: Picture, of_difference: Picture, of_squares: Picture) -> tuple[Picture, Picture]:
+    """SSIM and its contrast · structure factor from the windows' means of x, y, (x - y)² and x² + y².
+
+    The covariance comes from the variance of the difference, 2 σxy = σx² + σy² - σ(x-y)², because in float32 the mean
+    of x y less the product of the means would lose 1e-7, which is much where σ² is less than C2.
+    """
+    product, squares, apart = mx * my, mx * mx, mx - my
+    squares += my * my
+    apart *= apart
+    down = of_squares - squares
+    down += SSIM_C2
+    up = down - of_difference
+    up += apart
     structure = up / down
-    similarity = product.mul_(2.0).add_(SSIM_C1).mul_(up)
-    return similarity.div_(squares.add_(SSIM_C1).mul_(down).add_(SSIM_EPS)), structure
+    product *= 2.0
+    product += SSIM_C1
+    product *= up
+    squares += SSIM_C1
+    squares *= down
+    squares += SSIM_EPS
+    product /= squares
+    return product, structure
 
 
-def _luma(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
-    return image[0] * _LUMA[0] + image[1] * _LUMA[1] + image[2] * _LUMA[2]
+def _luma(image: Picture) -> Grey:
+    return np.asarray(cv2.transform(image, np.array([_LUMA])))
 
 
-def _halved(counts: Bool[Tensor, "h w"]) -> Tensor:
+def _half_size(image: np.ndarray) -> np.ndarray:
+    """Means of the 2 × 2 blocks (h // 2, w // 2)."""
+    h, w = image.shape[0] // 2, image.shape[1] // 2
+    return np.asarray(cv2.resize(image[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA))
+
+
+def _halved(counts: Counts) -> Bool[np.ndarray, "h//2 w//2"]:
     """The 2 × 2 blocks (h // 2, w // 2) all of whose pixels count."""
     h, w = counts.shape[0] // 2 * 2, counts.shape[1] // 2 * 2
     block = counts[:h, :w]
-    return block[::2, ::2] & block[1::2, ::2] & block[::2, 1::2] & block[1::2, 1::2]
+    return np.asarray(block[::2, ::2] & block[1::2, ::2] & block[::2, 1::2] & block[1::2, 1::2])
 
 
-def _gradient(image: Float[Tensor, "h w"], across: tuple[float, float, float]) -> Float[Tensor, "h w"]:
-    """Magnitude of the 3 × 3 gradient smoothed by ``across`` (normalised to sum 1), with zero padding."""
-    around = pad(image, [1] * 4)
-    weights = [weight / sum(across) for weight in across]
-    dx = around[:, 2:] - around[:, :-2]  # (h + 2, w)
-    dy = around[2:, :] - around[:-2, :]  # (h, w + 2)
-    dx = weights[0] * dx[:-2] + weights[1] * dx[1:-1] + weights[2] * dx[2:]
-    dy = weights[0] * dy[:, :-2] + weights[1] * dy[:, 1:-1] + weights[2] * dy[:, 2:]
-    return (dx.square() + dy.square()).sqrt()
+def _square_gradient(image: Grey, across: tuple[float, float, float], border: int) -> Grey:
+    """Squared magnitude of the 3 × 3 gradient smoothed by ``across`` (normalised to sum 1); what lies around is 0 or
+    replicated, by OpenCV's ``border``."""
+    along, smooth = np.array([-1.0, 0.0, 1.0]), np.array(across) / sum(across)
+    dx = np.asarray(cv2.sepFilter2D(image, -1, along, smooth, borderType=border))
+    dy = np.asarray(cv2.sepFilter2D(image, -1, smooth, along, borderType=border))
+    np.multiply(dx, dx, out=dx)
+    np.multiply(dy, dy, out=dy)
+    return np.asarray(np.add(dx, dy, out=dx))

@@ -252,6 +252,16 @@ def test_metrics_are_bit_identical_for_any_number_of_threads(name):
 
 
 @pytest.mark.parametrize("name", sorted(METRICS))
+def test_photos_of_eight_bits_are_measured_in_single_precision_to_six_digits(name):
+    """Rounding to 8 bits leaves flat and saturated places, where a variance is a small difference of large means."""
+    levels = [
+        (255 * (1.3 * picture - 0.1).clamp(0, 1)).round() for picture in (noisy(image(230, 310)), image(230, 310))
+    ]
+    single, double = ([(picture / 255).to(dtype) for picture in levels] for dtype in (torch.float32, torch.float64))
+    assert METRICS[name](*single) == pytest.approx(METRICS[name](*double), abs=5e-7)
+
+
+@pytest.mark.parametrize("name", sorted(METRICS))
 def test_metrics_refuse_invalid_images(name):
     measure, photo = METRICS[name], image(12, 12)
     with pytest.raises(ValueError, match="no pixel"):
