@@ -65,7 +65,7 @@ def part(out: Path, name: str) -> Path:
         (lambda out: part(out, "matches.pairs"), ["registration"]),
         (
             lambda out: part(out, "georef.frame"),
-            ["capture", "georeferencing", "geometry", "registration", "views"],
+            ["capture", "geometry", "georeferencing", "registration", "views"],
         ),
     ],
 )
@@ -76,5 +76,5 @@ def test_only_what_shows_a_changed_file_is_drawn_again(
     path = changed(out)
     data = path.read_bytes()
     path.unlink()  # the copy shares it with the run
-    path.write_bytes(data + b"\n")
+    path.write_bytes(data[:-1] + b" ")  # of another size, the whole stage would not count
     assert redrawn(out) == again
