@@ -57,12 +57,15 @@ def check_possible(out: Path, formats: str) -> None:
                 f"{name} is made from {files[0]}, which this run does not have.",
                 hint=f"Make it first: splatpipe surface {out} --products {product}",
             )
+    names = set(_parse_names(formats))
+    if not names & (NEED_METRES | NEED_PLACE):
+        return  # reading the frame loads NumPy
     from splatpipe.pipeline.survey.crs.frames import load_frame
 
     part = open_run_folder(out, LINE).lineage(GEOREF).get("georef.frame")
     if part is None:
         return
-    frame, names = load_frame(part.path), set(_parse_names(formats))
+    frame = load_frame(part.path)
     for missing, needing in ((not frame.in_metres, NEED_METRES), (frame.origin is None, NEED_PLACE)):
         if missing and names & needing:
             raise SplatpipeError(

@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # it imports pydantic
 MAX_JSON_BYTES = 128 << 20  # the pairs of 100,000 photos are smaller
 MAX_VALUES = 10_000_000  # those pairs are 8 million; a value takes up to 100 bytes, and three of the file's (`{},`)
 TOO_MANY_DIGITS = re.compile(rb"(?<![0-9])[0-9]{300}")  # neither a number that a float can hold nor a name
+STRIDE, IN_A_ROW = 30, re.compile(rb"[0-9]{10}")  # of 300 digits, every 30th is 10: seen sooner in much text
 
 
 def json_text(value: JSON) -> str:
@@ -40,7 +41,7 @@ def parse_json(data: bytes) -> Any:
     """
     if sum(map(data.count, (b",", b"[", b"{"))) > MAX_VALUES:
         raise ValueError(f"it has more than {MAX_VALUES:,} values")
-    if TOO_MANY_DIGITS.search(data):
+    if IN_A_ROW.search(data[::STRIDE]) and TOO_MANY_DIGITS.search(data):
         raise ValueError("it has a number of 300 digits or more")
     try:
         return json.loads(data.decode("utf-8"))
