@@ -181,7 +181,7 @@ TRAIN = Stage(
 )
 CLEAN = Stage(
     "clean",
-    version=2,
+    version=3,
     config=CleanConfig,
     reads=("train.model", "train.rendering", "train.sky", "undistort.dataset", "split.views"),
     parts={"model": "model.ply", "told": "cleaned.json"},
@@ -207,7 +207,7 @@ EVALUATE = Stage(
 )
 EXPORT = Stage(
     "export",
-    version=11,
+    version=12,
     config=ExportConfig,
     reads=(
         "clean.model",

@@ -10,19 +10,19 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
+from splatpipe.pipeline.engine.errors import StageError
 from splatpipe.pipeline.engine.files.output_file import write_file
 from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.geometry.plan_area import PlanArea
 from splatpipe.pipeline.photos.pixels.images import Mask, Pixels
-from splatpipe.pipeline.render.png import coded_png
 from splatpipe.pipeline.splat.quality import metrics
 
 ERROR_FULL_SCALE = 0.25  # mean absolute error over the channels shown as the brightest colour, in every image
 EQUAL_DB = 100.0  # stands for the infinite PSNR of identical images: JSON has no infinity
-MASKED_LEVEL, MASKED_GREY = 255, 128  # no error has that level: the scale ends at 191
+MASKED_GREY = 128
 MIN_INSIDE_SHARE = 0.01  # share of a photo inside the boundary below which it is not measured
 LEVELS = np.arange(256, dtype=np.float32) / np.float32(255.0)  # of 8 bits, as the metrics take them
 MAX_STEM_CHARACTERS = 100  # characters; file systems allow 255 bytes, and a letter may take four
@@ -46,12 +46,11 @@ def evaluate_view(
     camera, photo, mask = view
     whole = {} if inside is None else {"whole": measure(render, photo, mask)}
     mask = mask if inside is None else inside if mask is None else inside & mask
-    pictures = {"photo": coded_png(photo), "render": coded_png(render)}
-    pictures["error"] = coded_png(error_levels(render, photo, mask), error_colours())
+    _write_png(stem, "photo", photo)
+    _write_png(stem, "render", render)
+    _write_png(stem, "error", error_picture(render, photo, mask))
     if mask is not None:
-        pictures["mask"] = coded_png(np.where(mask, np.uint8(255), np.uint8(0)))
-    for kind, data in pictures.items():
-        write_file(stem.with_name(f"{stem.name}.{kind}.png"), data)
+        _write_png(stem, "mask", np.where(mask, np.uint8(255), np.uint8(0)))
     valid_share = 1.0 if mask is None else round(float(mask.mean()), 6)
     facts = {"name": camera.name, "file": stem.name, "width": photo.shape[1], "height": photo.shape[0]}
     figures = measure(render, photo, mask)
@@ -133,29 +132,16 @@ def mean_megapixels(per_view: Sequence[dict[str, Any]]) -> float | None:
     return round(math.fsum(sizes) / len(sizes), 3) if sizes else None
 
 
-def error_levels(render: Pixels, photo: Pixels, mask: Mask | None) -> UInt8[np.ndarray, "h w"]:
-    """Error of each pixel as an index of ``error_colours``: summed over the channels, on a fixed scale.
-
-    Args:
-        render: (h, w, 3).
-        photo: (h, w, 3).
-        mask: (h, w), True where pixels count.
-    """
+def error_picture(render: Pixels, photo: Pixels, mask: Mask | None) -> Pixels:
+    """Mean absolute error over the channels as a heat map of fixed scale, masked pixels grey; (h, w, 3) RGB."""
     red, green, blue = cv2.split(cv2.absdiff(render, photo))
-    levels = np.asarray(cv2.add(cv2.add(red, green), blue), np.uint8)  # ends at 255, which is beyond the scale
-    np.minimum(levels, np.uint8(MASKED_LEVEL - 1), out=levels)
+    sums = np.asarray(cv2.add(cv2.add(red, green), blue), np.uint8)  # ends at 255, which is beyond the scale
+    brightness = np.clip(np.arange(256) / 3 / 255.0 / ERROR_FULL_SCALE * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
+    colours = np.ascontiguousarray(cv2.applyColorMap(brightness, cv2.COLORMAP_INFERNO)[:, :, ::-1])
+    picture = np.asarray(cv2.LUT(cv2.merge([sums] * 3), colours), np.uint8)
     if mask is not None:
-        levels[~mask] = MASKED_LEVEL
-    return levels
-
-
-def error_colours() -> UInt8[np.ndarray, "256 3"]:
-    """The RGB of each error level: a heat map, and grey for masked pixels."""
-    brightness = np.arange(256) / 3 / 255.0 / ERROR_FULL_SCALE * 255.0 + 0.5
-    scaled = np.clip(brightness, 0.0, 255.0).astype(np.uint8)
-    colours = np.asarray(cv2.applyColorMap(scaled, cv2.COLORMAP_INFERNO), np.uint8).reshape(-1, 3)[:, ::-1].copy()
-    colours[MASKED_LEVEL] = MASKED_GREY
-    return colours
+        picture[~mask] = MASKED_GREY
+    return picture
 
 
 def flat_stems(names: Sequence[str]) -> list[str]:
@@ -177,3 +163,11 @@ def flat_stems(names: Sequence[str]) -> list[str]:
         taken.add(stem.casefold())
         stems.append(stem)
     return stems
+
+
+def _write_png(stem: Path, kind: str, pixels: Pixels) -> None:
+    ordered = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".png", ordered)
+    if not done:
+        raise StageError(f"The {kind} of {stem.name} could not be coded as PNG.")
+    write_file(stem.with_name(f"{stem.name}.{kind}.png"), data.tobytes())

@@ -9,9 +9,9 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO
 
 from splatpipe.pipeline.engine.errors import MachineError, SplatpipeError
 from splatpipe.pipeline.engine.files.durable import remove_unfinished, write_durably
@@ -20,12 +20,8 @@ from splatpipe.pipeline.engine.files.small_file import open_regular
 from splatpipe.pipeline.engine.heap import imports_outside_gc
 from splatpipe.pipeline.engine.python_module import python_module
 
-if TYPE_CHECKING:
-    from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
-
 REPORT_FILE = "report.html"
 PDF_FILE = "report.pdf"
-PICTURES_FILE = Path("stages", "pictures.json")  # the last report's pictures, for the next
 HEAD_BYTES = 4096  # beginning of the page, which contains the digest of its results
 TIMEOUT_S = 600.0  # far more than hundreds of photos take
 MIN_S = 2.0  # minimum time granted: enough for the report without images, even on a busy machine
@@ -48,45 +44,19 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
         RuntimeError: if the PDF cannot be set; the page is there.
     """
     with imports_outside_gc():
-        from splatpipe.pipeline.app.report.charts.gallery import Gallery
         from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
-        from splatpipe.pipeline.app.report.page import report_content
+        from splatpipe.pipeline.app.report.page import report_content, report_page, run_labels
 
     inputs = read_report_inputs(out)
-    if not drawn:
-        _write(out, inputs, report_content(inputs, drawn=False))
-        return out / REPORT_FILE
-    gallery = Gallery.read(out)
-    try:
-        content = report_content(inputs, drawn=True, gallery=gallery)
-        is_good = not (gallery.reused and _has_trouble(content))
-        if is_good:
-            _write(out, inputs, content)
-    except Exception:
-        if not gallery.reused:
-            raise
-        is_good = False
-    if not is_good:  # what was kept may be to blame: it may be somebody else's
-        gallery = Gallery(out, {})
-        _write(out, inputs, report_content(inputs, drawn=True, gallery=gallery))
-    gallery.write()
-    return out / REPORT_FILE
-
-
-def _has_trouble(content: Mapping[str, Any]) -> bool:
-    return any(isinstance(chapter, dict) and "trouble" in chapter for chapter in content.values())
-
-
-def _write(out: Path, inputs: ReportInputs, content: Mapping[str, Any]) -> None:
-    from splatpipe.pipeline.app.report.page import report_page, run_labels
-
+    content = report_content(inputs, drawn=drawn)
     (out / PDF_FILE).unlink(missing_ok=True)  # an earlier run's must not lie beside this page
     write_durably(out / REPORT_FILE, report_page(inputs, content))
-    if content["drawn"]:
+    if drawn:
         from splatpipe.pipeline.app.report.pdf import report_pdf
 
         pdf = report_pdf(content, run_labels(inputs))
         write_durably(out / PDF_FILE, lambda file: file.write(pdf))
+    return out / REPORT_FILE
 
 
 def is_current(out: Path) -> bool:
@@ -156,8 +126,8 @@ def _run(command: Sequence[str], log: IO[bytes], over: Callable[[], bool], out: 
     finally:
         process.kill()
         code = process.wait()
-        for path in (out / REPORT_FILE, out / PDF_FILE, out / PICTURES_FILE):
-            remove_unfinished(path.parent, path.name, process.pid)
+        for name in (REPORT_FILE, PDF_FILE):
+            remove_unfinished(out, name, process.pid)
     return code
 
 

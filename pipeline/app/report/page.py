@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,6 @@ from splatpipe.pipeline.app.report.chapters.georeferencing import georeferencing
 from splatpipe.pipeline.app.report.chapters.processing import files_chapter, messages_chapter, processing_chapter
 from splatpipe.pipeline.app.report.chapters.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.chapters.training import training_chapter, views_chapter
-from splatpipe.pipeline.app.report.charts.gallery import Gallery, Keep, draw_now
-from splatpipe.pipeline.app.report.facts.picture_sources import limited, source_facts
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs, results_digest
 from splatpipe.pipeline.app.report.facts.wording import count, duration, judged_of, judged_size, length, moment, number
 from splatpipe.pipeline.app.report.verdict import judge
@@ -26,37 +23,22 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.charts.geometry import Geometry
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
-Chapter = dict[str, Any]
-Build = Callable[[], Chapter | None]
-# The parts that each chapter with pictures may see.
-MODEL = ("sparse.model", "georef.model", "georef.frame")
-CAPTURE = (
-    "ingest.photos",
-    "ingest.left_out",
-    "ingest.positions",
-    "ingest.cameras",
-    "georef.accuracy",
-    "split.views",
-)
-REGISTRATION = ("ingest.photos", "sparse.summary", "matches.pairs", "georef.accuracy")
-GEOREFERENCING = ("ingest.photos", "georef.control", "georef.accuracy", "evaluate.metrics", "export.georef")
-VIEWS = ("ingest.photos", "evaluate.metrics", "evaluate.views")
 
 
-def report_content(inputs: ReportInputs, *, drawn: bool, gallery: Gallery | None = None) -> dict[str, Any]:
+def report_content(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
     """What a report says: the values for the template of the page, and for that of the PDF.
 
     Args:
         inputs: The report's inputs.
         drawn: Whether to include charts and images; without them it is quick.
-        gallery: Pictures of the last report, which receives those of this one; None draws them all.
     """
     if not drawn:
-        return _content(inputs, None, draw_now)
-    if gallery is None:
-        gallery = Gallery(inputs.out, {})  # kept pictures pass through it, so drawn ones do, too: they are the same
-    keep = gallery.keep
-    return _content(inputs, _Scene(limited(inputs, MODEL), keep), keep)
+        return _content(inputs, None, None, drawn=False)
+    from splatpipe.pipeline.app.report.charts.drawing import styled
+
+    geometry, trouble = _geometry(inputs)
+    with styled():
+        return _content(inputs, geometry, trouble, drawn=True)
 
 
 def report_page(inputs: ReportInputs, content: Mapping[str, Any]) -> str:
@@ -80,9 +62,7 @@ def _name(inputs: ReportInputs) -> str:
     return inputs.out.resolve().name or str(inputs.out)
 
 
-def _content(inputs: ReportInputs, scene: _Scene | None, keep: Keep) -> dict[str, Any]:
-    drawn = scene is not None
-    chapters = _chapters(inputs) if scene is None else _drawn_chapters(inputs, scene, keep)
+def _content(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> dict[str, Any]:
     return {
         "name": _name(inputs),
         "photos_dir": "" if inputs.photos_dir is None else inputs.photos_dir.name,
@@ -92,89 +72,19 @@ def _content(inputs: ReportInputs, scene: _Scene | None, keep: Keep) -> dict[str
         "key_figures": _guarded(lambda: {"cards": _cards(inputs)}),
         "drawn": drawn,
         "results": results_digest(inputs) if drawn else "",
-        "geometry_trouble": None if scene is None else scene.trouble or None,
-        **{name: _guarded(build) for name, build in chapters.items()},
-        "training": _guarded(lambda: training_chapter(inputs, drawn=drawn, keep=keep)),
-        "surfaces": _guarded(lambda: surfaces_chapter(inputs, drawn=drawn, keep=keep)),
+        "geometry_trouble": trouble,
+        "capture": _guarded(lambda: capture_chapter(inputs, geometry, drawn=drawn) if _checked(inputs) else None),
+        "registration": _guarded(
+            lambda: registration_chapter(inputs, geometry, drawn=drawn) if _matched(inputs) else None
+        ),
+        "georeferencing": _guarded(lambda: georeferencing_chapter(inputs, geometry)),
+        "training": _guarded(lambda: training_chapter(inputs, drawn=drawn)),
+        "views": _guarded(lambda: views_chapter(inputs, drawn=drawn)),
+        "surfaces": _guarded(lambda: surfaces_chapter(inputs, drawn=drawn)),
         "processing": _guarded(lambda: processing_chapter(inputs, drawn=drawn)),
         "files": _guarded(lambda: files_chapter(inputs)),
         "messages": _guarded(lambda: messages_chapter(inputs)),
     }
-
-
-def _chapters(inputs: ReportInputs) -> dict[str, Build]:
-    """The chapters with pictures, without them."""
-    return {
-        "capture": lambda: capture_chapter(inputs, None, drawn=False) if _checked(inputs) else None,
-        "registration": lambda: registration_chapter(inputs, None, drawn=False) if _matched(inputs) else None,
-        "georeferencing": lambda: georeferencing_chapter(inputs, None),
-        "views": lambda: views_chapter(inputs, drawn=False),
-    }
-
-
-def _drawn_chapters(inputs: ReportInputs, scene: _Scene, keep: Keep) -> dict[str, Build]:
-    """The same with pictures; each is made from limited inputs, which its key covers, and kept as a whole."""
-
-    def kept(name: str, seen: ReportInputs, build: Callable[[ReportInputs], Chapter | None]) -> Build:
-        def drawn() -> Chapter | None:
-            from splatpipe.pipeline.app.report.charts.drawing import styled
-
-            with styled():
-                return build(seen)
-
-        return lambda: keep(name, source_facts(seen), drawn)
-
-    def see(*parts: str, summaries: tuple[str, ...] = (), photos: bool = False) -> ReportInputs:
-        return limited(inputs, (*MODEL, *parts), summaries, photos=photos)
-
-    capture = see(*CAPTURE, summaries=("ingest",))
-    registration = see(*REGISTRATION, summaries=("features", "matches", "sparse", "georef"), photos=True)
-    georeferencing = see(*GEOREFERENCING, summaries=("georef", "sparse"), photos=True)
-    chapters = {
-        "capture": kept("capture", capture, lambda seen: capture_chapter(seen, scene.geometry, drawn=True)),
-        "registration": kept(
-            "registration", registration, lambda seen: registration_chapter(seen, scene.geometry, drawn=True)
-        ),
-        "georeferencing": kept(
-            "georeferencing", georeferencing, lambda seen: georeferencing_chapter(seen, scene.geometry)
-        ),
-        "views": kept("views", see(*VIEWS), lambda seen: views_chapter(seen, drawn=True)),
-    }
-    present = {"capture": _checked(inputs), "registration": _matched(inputs)}
-    return {name: build if present.get(name, True) else _nothing for name, build in chapters.items()}
-
-
-def _nothing() -> None:
-    """A chapter for which there is no data."""
-
-
-class _Scene:
-    """The sparse model's geometry, read only if something is drawn from it.
-
-    Args:
-        inputs: Limited to what it is read from.
-        keep: Keeps whether it can be read.
-    """
-
-    def __init__(self, inputs: ReportInputs, keep: Keep) -> None:
-        self._inputs, self._keep = inputs, keep
-
-    @cached_property
-    def trouble(self) -> str:
-        """Why it cannot be read; empty if it can, or there is none."""
-        facts = [source_facts(self._inputs)]
-        trouble = self._keep("geometry", facts, lambda: self._read[1] or "")
-        if not isinstance(trouble, str):
-            raise TypeError("the kept text is none")
-        return trouble
-
-    @property
-    def geometry(self) -> Geometry | None:
-        return self._read[0]
-
-    @cached_property
-    def _read(self) -> tuple[Geometry | None, str | None]:
-        return _geometry(self._inputs)
 
 
 def run_labels(inputs: ReportInputs) -> PathLabels:

@@ -39,8 +39,8 @@ MIN_CORRELATION = 0.7  # correlation of a square's pixels with the dictionary's 
 # for any other. Windows of a façade reach 0.79; rendered targets of 20 px or more have at least 0.86.
 DENSEST, MIN_OF_DENSEST = "DICT_4X4_250", 0.83
 MIN_CONTRAST = 25.0  # white minus black, grey levels of 255
-# Grey levels by which black is darker than its surroundings' mean, which lies halfway to white. OpenCV's 7 finds no more
-# targets, but in sand and grass many squares of less than MIN_CONTRAST, and twice the time goes into reading those.
+# Grey levels by which black is darker than its surroundings' mean, which lies halfway to white. OpenCV's 7 finds no
+# more targets, but many squares of less than MIN_CONTRAST in sand and grass, which take most of the time to read.
 DARKER_THAN_MEAN = 10.0
 CENTRE_SIGMA_PX = 0.1
 

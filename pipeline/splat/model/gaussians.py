@@ -187,23 +187,8 @@ def multiply_quats(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Floa
 
 
 def quat_from_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
-    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
+    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix."""
+    from scipy.spatial.transform import Rotation  # half a CPU second, which other commands need not pay
 
-    By the largest of the four components, which is divided by: S. W. Shepperd, "Quaternion from rotation matrix",
-    Journal of Guidance and Control 1 (1978). SciPy does the same, and half a CPU second is spent loading it.
-    """
-    m = rotation.detach().cpu().double().tolist()
-    trace = m[0][0] + m[1][1] + m[2][2]
-    squares = [m[0][0], m[1][1], m[2][2], trace]
-    i = squares.index(max(squares))
-    quat = [0.0, 0.0, 0.0, 0.0]  # x, y, z, w, times four times the largest
-    if i == 3:
-        quat = [m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1], 1.0 + trace]
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        quat[i] = 1.0 - trace + 2.0 * m[i][i]
-        quat[j], quat[k] = m[j][i] + m[i][j], m[k][i] + m[i][k]
-        quat[3] = m[k][j] - m[j][k]
-    length = math.copysign(math.sqrt(sum(value * value for value in quat)), quat[3])
-    x, y, z, w = (value / length for value in quat)
+    x, y, z, w = Rotation.from_matrix(rotation.detach().cpu().double().numpy()).as_quat(canonical=True)
     return torch.tensor([w, x, y, z], dtype=rotation.dtype, device=rotation.device)

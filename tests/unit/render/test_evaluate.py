@@ -161,7 +161,7 @@ def test_error_picture_has_a_fixed_scale_and_greys_what_is_masked() -> None:
     render[1, 2] += 155
     mask = np.ones((2, 3), bool)
     mask[1, 0] = False
-    picture = view_measures.error_colours()[view_measures.error_levels(render, photo, mask)]
+    picture = view_measures.error_picture(render, photo, mask)
     brightness = picture.astype(int).sum(axis=2)
     assert brightness[0, 0] < brightness[0, 1] < brightness[0, 2]
     np.testing.assert_array_equal(picture[0, 2], picture[1, 2])  # both beyond the scale's end

@@ -53,7 +53,8 @@ def test_gradient_is_the_derivative_of_the_cost_with_points_settled(flight: Flow
     sizes = 1.0 / np.sqrt(np.diag(reduced.normal))
     for _ in range(3):
         step = 1e-2 * rng.normal(size=block.unknowns) * sizes
-        ahead, back = (settle_points(block.moved(side * step, np.zeros_like(block.points)), 8).cost() for side in (1.0, -1.0))
+        still = np.zeros_like(block.points)
+        ahead, back = (settle_points(block.moved(side * step, still), 8).cost() for side in (1.0, -1.0))
         assert (ahead - back) / 2.0 == pytest.approx(2.0 * float(reduced.gradient @ step), rel=1e-3)
 
 
@@ -71,7 +72,8 @@ def test_distances_join_their_points_in_the_equations(flight: FlownBlock) -> Non
     sizes = 1.0 / np.sqrt(np.diag(reduced.normal))
     for _ in range(3):
         step = 1e-2 * rng.normal(size=block.unknowns) * sizes
-        ahead, back = (settle_points(block.moved(side * step, np.zeros_like(block.points)), 8).cost() for side in (1.0, -1.0))
+        still = np.zeros_like(block.points)
+        ahead, back = (settle_points(block.moved(side * step, still), 8).cost() for side in (1.0, -1.0))
         assert (ahead - back) / 2.0 == pytest.approx(2.0 * float(reduced.gradient @ step), rel=2e-3)
     alone = reduce_block(replace(block, distances=part_of(block, np.zeros(len(block), dtype=bool)).distances))
     assert np.linalg.eigvalsh(reduced.normal - alone.normal).min() > -1e-6 * np.diag(alone.normal).max()

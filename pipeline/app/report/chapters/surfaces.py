@@ -7,12 +7,9 @@ from typing import Any
 from urllib.parse import quote
 
 from splatpipe.pipeline.app.measurements import SECTIONS, VOLUMES, outdated, read_measurements, title_of
-from splatpipe.pipeline.app.report.charts.gallery import Keep, draw_now
-from splatpipe.pipeline.app.report.facts.picture_sources import limited, path_facts, source_facts
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.facts.wording import count, length
 
-RASTERS = ("ortho.files", "dsm.files", "dtm.files")
 PICTURE_SIDE = 960  # pixels
 FACADE_SIDE = 480
 MAX_FACADES = 12  # with an image; the list has all
@@ -26,13 +23,12 @@ SIGMA_DIGITS = 2  # significant digits of a standard deviation
 Chapter = dict[str, Any]
 
 
-def surfaces_chapter(inputs: ReportInputs, *, drawn: bool, keep: Keep = draw_now) -> Chapter | None:
+def surfaces_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     """The chapter on the surface model and the orthophoto; None if there are none.
 
     Args:
         inputs: The report's inputs.
         drawn: Whether to include images.
-        keep: Keeps them.
     """
     dsm, ortho = inputs.summary("dsm"), inputs.summary("ortho")
     if not dsm.get("cells"):
@@ -60,11 +56,9 @@ def surfaces_chapter(inputs: ReportInputs, *, drawn: bool, keep: Keep = draw_now
     if mesh.get("pages"):
         pages = f"{count(mesh['pages'])} image{'s' if mesh['pages'] > 1 else ''}"
         facts.append(("textures of the mesh", f"{pages}, {mesh['texture_pixels'] / 1e6:.0f} megapixels"))
-    facades = _facades(inputs, drawn=drawn, keep=keep)
-    seen = limited(inputs, RASTERS)
-    pictures = keep("surfaces", source_facts(seen), lambda: _pictures(seen)) if drawn else []
-    chapter = {"facts": facts, "pictures": pictures, "facades": facades}
-    return {**chapter, "measured": _measurement_tables(inputs, drawn=drawn, keep=keep)}
+    facades = _facades(inputs, drawn=drawn)
+    chapter = {"facts": facts, "pictures": _pictures(inputs) if drawn else [], "facades": facades}
+    return {**chapter, "measured": _measurement_tables(inputs, drawn=drawn)}
 
 
 def measures(inputs: ReportInputs) -> dict[str, Any]:
@@ -86,17 +80,16 @@ def measures(inputs: ReportInputs) -> dict[str, Any]:
     }
 
 
-def _measurement_tables(inputs: ReportInputs, *, drawn: bool, keep: Keep) -> dict[str, Any]:
+def _measurement_tables(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
     """Sections and volumes, with thumbnails of the first sections."""
     tables = measures(inputs)
     for number, row in enumerate(tables["sections"]):
         path = row.pop("picture")
-        if drawn and path is not None and number < MAX_SECTIONS:
-            row |= _kept_picture(f"section {number}", path, SECTION_SIDE, keep)
+        row |= _small_picture(path, SECTION_SIDE) if drawn and path is not None and number < MAX_SECTIONS else {}
     return tables
 
 
-def _facades(inputs: ReportInputs, *, drawn: bool, keep: Keep) -> list[dict[str, Any]]:
+def _facades(inputs: ReportInputs, *, drawn: bool) -> list[dict[str, Any]]:
     """Façades, largest first, with thumbnails of the first ones."""
     if not inputs.summary("facades").get("facades"):
         return []
@@ -107,15 +100,10 @@ def _facades(inputs: ReportInputs, *, drawn: bool, keep: Keep) -> list[dict[str,
         row = {"name": str(each["name"]), "area": f"{float(each['area_m2']):.1f} m²"}
         row["known"] = f"{100.0 * float(each['share_with_depth']):.0f} %"
         path = _file(inputs, "facades.files", f"facades/{each['picture']}")
-        if drawn and path is not None and number < MAX_FACADES:
-            row |= _kept_picture(f"façade {number}", path, FACADE_SIDE, keep)
-        rows.append(row)
+        rows.append(
+            row | (_small_picture(path, FACADE_SIDE) if drawn and path is not None and number < MAX_FACADES else {})
+        )
     return rows
-
-
-def _kept_picture(name: str, path: Path, side: int, keep: Keep) -> dict[str, Any]:
-    found: dict[str, Any] = keep(name, [path_facts(path), side], lambda: _small_picture(path, side))
-    return found
 
 
 def _small_picture(path: Path, side: int) -> dict[str, Any]:

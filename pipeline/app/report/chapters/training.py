@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from splatpipe.pipeline.app.report.charts.gallery import Keep, draw_now
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.facts.wording import count, duration, judged_size, number, share, size
 
@@ -21,13 +20,12 @@ MEASURES = {  # metrics of a held-out photo: title with the unit, digits
 MAX_ROWS = 200  # held-out photos in the table
 
 
-def training_chapter(inputs: ReportInputs, *, drawn: bool, keep: Keep = draw_now) -> Chapter | None:
+def training_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter | None:
     """The chapter on training: plan, result and curves; None if training was not reached.
 
     Args:
         inputs: The report's inputs.
         drawn: Whether to draw charts.
-        keep: Keeps them.
     """
     stage = inputs.history.stages.get("train")
     in_blocks = any(name.startswith("train.") for name in inputs.history.stages)
@@ -66,9 +64,7 @@ def training_chapter(inputs: ReportInputs, *, drawn: bool, keep: Keep = draw_now
         "charts": [],
     }
     if drawn:
-        end = None if planned is None else float(planned)
-        facts_drawn = [{name: sorted(curve.items()) for name, curve in curves.items()}, end]
-        chapter["charts"] = keep("training", facts_drawn, lambda: _curve_charts(curves, end))
+        chapter["charts"] = _curve_charts(curves, None if planned is None else float(planned))
     return chapter
 
 
@@ -176,7 +172,6 @@ def _curves(inputs: ReportInputs, history: Mapping[str, Any]) -> dict[str, dict[
 
 def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | None) -> list[dict[str, Any]]:
     from splatpipe.pipeline.app.report.charts.charts import training_curve
-    from splatpipe.pipeline.app.report.charts.drawing import styled
 
     labels = {
         "loss": (
@@ -190,8 +185,7 @@ def _curve_charts(curves: Mapping[str, Mapping[float, float]], planned: float | 
     for name, (label, log, text) in labels.items():
         curve = {step: value for step, value in curves.get(name, {}).items() if value == value}
         if len(curve) > 1:
-            with styled():
-                charts.append({"svg": training_curve(label, curve, planned, log), "text": text})
+            charts.append({"svg": training_curve(label, curve, planned, log), "text": text})
     return charts
 
 
