@@ -22,6 +22,7 @@ from splatpipe.pipeline.photos.pixels.images import Mask, Pixels, reduced_camera
 from splatpipe.pipeline.raster.device import choose_device
 from splatpipe.pipeline.raster.threads import same_bits
 from splatpipe.pipeline.render.rendering import as_trained
+from splatpipe.pipeline.splat.containers.archives import open_archive
 from splatpipe.pipeline.splat.containers.ply import read_splat, read_splat_header, write_splat_parts
 from splatpipe.pipeline.splat.model.gaussians import Gaussians
 from splatpipe.pipeline.splat.sky.panorama import read_panorama
@@ -74,14 +75,14 @@ def _clean(config: CleanConfig, gaussians: Gaussians, inputs: Inputs, folder: Pa
     sky = read_panorama(inputs["train.sky"])
 
     def picture(index: int) -> tuple[Pixels, Mask | None]:
-        kept, kept_mask = folder / f"{index}.npy", folder / f"{index}.mask.npy"
-        if not kept.exists():
+        path = folder / f"{index}.npz"
+        if not path.exists():
             _, photo, mask = reduced_view(views[index], SEEN_MEGAPIXELS)
-            np.save(kept, photo)
-            if mask is not None:
-                np.save(kept_mask, mask)
+            np.savez(path, photo=photo, masks=np.zeros((0, *photo.shape[:2]), np.bool_) if mask is None else mask[None])
             return photo, mask
-        return np.load(kept), np.load(kept_mask) if kept_mask.exists() else None
+        with open_archive(path) as arrays:
+            masks = arrays["masks"]
+            return arrays["photo"], masks[0] if len(masks) else None
 
     compared = None
     if config.photos == "covering":
