@@ -36,4 +36,4 @@ class DepthsConfig(StageConfig):
     enabled: bool = True
     """Estimate a depth map for every photo; the surface products are made from them."""
     max_megapixels: PositiveFloat = 1.2
-    """Photos are reduced to this size before their depths are estimated: 5 to 10 CPU seconds per megapixel."""
+    """Photos are reduced to this size before their depths are estimated: 9 to 13 CPU seconds per megapixel."""
