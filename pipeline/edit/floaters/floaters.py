@@ -46,6 +46,9 @@ EVIDENCE = {
 }
 """Weight of each feature of ``evidence`` in the log-odds that a Gaussian is a floater."""
 PRIOR = -6.3
+NEEDLESS = (0.001, 0.8, 0.5)
+"""Least use to the photos (as ``LIMITS``), largest share in front of everything and least opacity of a Gaussian that is
+kept although it hangs where a camera was."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,15 +93,28 @@ def likely_floaters(suspects: Suspects, photos: TrainingPhotos, on_progress: Cal
     """
     if suspects.ground.sum() <= NEIGHBOURS:
         return np.zeros(len(suspects.ground), np.bool_)  # not enough of a scene for anything to float in front of
-    figures = evidence(suspects, verdicts_of(suspects, photos, on_progress))
+    verdicts = verdicts_of(suspects, photos, on_progress)
+    figures = evidence(suspects, verdicts)
     odds = PRIOR + sum(EVIDENCE[name] * figure for name, figure in figures.items())
-    likely = np.asarray(suspects.suspected & (odds > 0.0))
+    likely = np.asarray(suspects.suspected & ((odds > 0.0) | needless(suspects, verdicts, figures)))
     if not likely.any():
         return likely
     done_before = len(LIMITS) * len(photos.compared_photos)
     worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, on_progress, done_before))
     missed = (worth.better - worth.worse) / _pixels(suspects) > LIMITS[-1][1]
     return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # a loose one may hide other floaters
+
+
+def needless(suspects: Suspects, verdicts: Verdicts, figures: dict[str, Figures]) -> Flags:
+    """Which of the suspects hang faintly where a camera was and help no photo.
+
+    Training leaves such Gaussians where no photo looks from nearby; from afar they hardly differ from what is behind
+    them, but a camera between two others meets them as veils.
+    """
+    use, floating, opacity = NEEDLESS
+    of_none = (verdicts.better - verdicts.worse) / _pixels(suspects) < use
+    hanging = (figures["floating"] > floating) & (figures["opacity"] < opacity)
+    return np.asarray(suspects.suspected & suspects.sightings.beside & hanging & of_none)
 
 
 def _pixels(suspects: Suspects) -> Figures:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from splatpipe.pipeline.edit.floaters.depth_islands import without_islands
@@ -28,6 +28,8 @@ from splatpipe.pipeline.splat.model.sh import C0
 from splatpipe.pipeline.splat.sky.panorama import Panorama
 
 MIN_VISIBLE_PX = 1e-3  # visible area in one photo, pixels, below which a Gaussian is not seen: less is rounding
+NEAR_SHARE = 0.2  # of the depth where a photo's scene begins: nearer to its camera there is nothing, in any direction
+BEGINS_PERCENTILE = 5  # of a photo's depths, where its scene begins
 BORDER_SHARE = 0.08  # width of the border as a share of an image's shorter side: seen only there is hardly covered
 IN_FRONT_SHARE = 0.005  # a Gaussian floats if it is that much, relative to the depth, in front of the background,
 IN_FRONT_SIGMAS = 2.0  # and its least distance to it in its standard deviations along the view axis
@@ -69,6 +71,8 @@ class GaussianVisibility:
         floating: Share of its visible area in photos where it lies in front of everything around it.
         gap: How far in front of its surroundings it lies as a share of their depth, weighted mean, -1..1.
         compared: Its weight in the photos that suspects are compared with.
+        beside: Whether its centre is so near to a camera, before it, beside it or behind, that whoever took the photo
+            must have seen past it.
     """
 
     weight: Float32[np.ndarray, " n"]
@@ -78,6 +82,7 @@ class GaussianVisibility:
     floating: Float32[np.ndarray, " n"]
     gap: Float32[np.ndarray, " n"]
     compared: Float32[np.ndarray, " n"]
+    beside: Bool[np.ndarray, " n"]
 
 
 class _VisibilitySums:
@@ -87,6 +92,7 @@ class _VisibilitySums:
         self.weight, self.square, self.border, self.compared = (np.zeros(n, np.float32) for _ in range(4))
         self.area, self.before, self.gap = (np.zeros(n, np.float32) for _ in range(3))
         self.towards = np.zeros((n, 3), np.float32)
+        self.beside = np.zeros(n, np.bool_)
 
     def sightings(self) -> GaussianVisibility:
         def part(value: Float32[np.ndarray, " n"], of: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
@@ -97,7 +103,7 @@ class _VisibilitySums:
         angle[self.weight == 0.0] = 0.0
         photos = part(self.weight * self.weight, self.square)
         border, before, gap = part(self.border, self.weight), part(self.before, self.area), part(self.gap, self.weight)
-        return GaussianVisibility(self.weight, photos, angle, border, before, gap, self.compared)
+        return GaussianVisibility(self.weight, photos, angle, border, before, gap, self.compared, self.beside)
 
 
 def measure_visibility(
@@ -123,6 +129,7 @@ def measure_visibility(
         _add(sums, rows, found[rows], camera, (centres[rows], axes[rows]))
         if index in compared_indices:
             sums.compared[rows] += found[rows, 0]
+        sums.beside[_within(centres, camera, NEAR_SHARE * _begins(behind))] = True
         on_progress(index + 1)
     return sums.sightings()
 
@@ -148,6 +155,17 @@ def _border(camera: Camera) -> Float32[np.ndarray, "h w"]:
     width = max(1, round(BORDER_SHARE * min(camera.height, camera.width)))
     picture[width:-width, width:-width] = 0.0
     return picture
+
+
+def _begins(depth: Float32[np.ndarray, "h w"]) -> float:
+    """Depth where the scene of a photo begins, world units; 0 if it shows none."""
+    shown = depth[depth > 0.0]
+    return float(np.percentile(shown, BEGINS_PERCENTILE)) if len(shown) else 0.0
+
+
+def _within(centres: Float32[np.ndarray, "n 3"], camera: Camera, distance: float) -> Bool[np.ndarray, " n"]:
+    off = centres - camera.centre().astype(np.float32)
+    return np.asarray(np.einsum("ni,ni->n", off, off) < distance * distance)
 
 
 def _add(

@@ -58,8 +58,13 @@ def scene() -> Gaussians:
 
 def camera(eye: tuple[float, float, float], name: str) -> Camera:
     """Return a camera that looks at the scene's centre."""
+    return looking(eye, (0.0, 0.0, 0.7), name)
+
+
+def looking(eye: tuple[float, float, float], at: tuple[float, float, float], name: str = "") -> Camera:
+    """Return a camera that looks at a point."""
     centre = np.array(eye)
-    forward = np.array([0.0, 0.0, 0.7]) - centre
+    forward = np.array(at) - centre
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -155,6 +160,38 @@ def test_real_floating_objects_are_kept_because_of_the_photos() -> None:
 
     assert clean_scene(real, TrainingPhotos(cameras(), OPTIONS, picture)).keep[-2:].all()
     assert not clean_scene(real, photos(pictures=True)).keep[-2:].any()  # on photos without them
+
+
+def test_a_veil_beside_a_camera_is_found_if_it_helps_no_photo() -> None:
+    """Two walls at a right angle; most photos show one from afar, the last was taken right before it, along it.
+
+    A rod from the wall holds the veil: what is held by nothing is found anyway.
+    """
+    near = looking((1.0, -1.0, 1.0), (8.0, -1.0, 1.0))
+    far = [looking((x, -9.0, 1.0), (x, 0.0, 1.0)) for x in (-1.0, 0.0, 1.0, 2.0)]
+    walls = Gaussians.concat(
+        [
+            made_of(grid((-4, 0, -2), (8, 0, 4)), (0.07, 0.02, 0.07), 0.6),
+            made_of(grid((8, -5, -2), (8, 0, 4)), (0.02, 0.07, 0.07), 0.4),
+            made_of(grid((0.95, -0.6, 1.05), (0.95, 0, 1.05)), (0.02, 0.05, 0.02), 0.6),
+        ]
+    )
+    veil = made_of(np.array([[0.95, -0.75, 1.05]]), 0.1, 0.6, opacity=0.3)
+
+    def kept(cameras: list[Camera], taken_of: Gaussians, veil: Gaussians = veil) -> bool:
+        def picture(index: int) -> tuple[Pixels, Mask | None]:
+            with torch.no_grad():
+                colour = rasterizer.render(taken_of, cameras[index], OPTIONS).colour
+            return (colour.clamp(0.0, 1.0) * 255.0 + 0.5).numpy().astype(np.uint8), None
+
+        cleaned = clean_scene(Gaussians.concat([walls, veil]), TrainingPhotos(cameras, OPTIONS, picture))
+        assert cleaned.keep[:-1].float().mean() >= 0.995
+        return bool(cleaned.keep[-1])
+
+    assert not kept([*far, near], walls)
+    assert kept(far, walls)  # nobody was there
+    dark = replace(veil, sh=torch.full_like(veil.sh, -1.5))
+    assert kept([*far, near], Gaussians.concat([walls, dark]), dark)  # the photos show it
 
 
 def test_some_photos_suffice_to_find_floaters_and_what_they_do_not_show_is_kept() -> None:
