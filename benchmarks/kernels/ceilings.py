@@ -25,8 +25,9 @@ def measure_ceilings(threads: int) -> dict[str, float | str]:
         threads: Concurrent threads, each with its own registers and memory.
 
     Returns:
-        ``fma_gflops_per_core`` (an FMA counts as two; by CPU time, with all threads busy), ``copy_gb_s`` of all threads
-            together (bytes read and written both count), and the ``ceiling_isa`` that they were measured with.
+        ``fma_gflops_per_core`` (an FMA counts as two; by CPU time, with all threads busy), ``gproducts_per_core`` (of
+            8-bit numbers, summed to 32 bits, by VNNI or AVX2, else as floats), ``copy_gb_s`` of all threads together
+            (bytes read and written both count), and the ``ceiling_isa`` that they were measured with.
     """
     isa = _native.isas()[0]
     with tempfile.TemporaryDirectory() as folder:
@@ -36,6 +37,7 @@ def measure_ceilings(threads: int) -> dict[str, float | str]:
         found = json.loads(subprocess.run([program, str(threads)], check=True, capture_output=True).stdout)
     return {
         "fma_gflops_per_core": round(found["gflops"], 2),
+        "gproducts_per_core": round(found["gproducts"], 2),
         "copy_gb_s": round(found["copy_gb_s"], 2),
         "ceiling_isa": isa,
     }
