@@ -181,7 +181,7 @@ TRAIN = Stage(
 )
 CLEAN = Stage(
     "clean",
-    version=3,
+    version=4,
     config=CleanConfig,
     reads=("train.model", "train.rendering", "train.sky", "undistort.dataset", "split.views"),
     parts={"model": "model.ply", "told": "cleaned.json"},
