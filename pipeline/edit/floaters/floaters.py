@@ -46,9 +46,9 @@ EVIDENCE = {
 }
 """Weight of each feature of ``evidence`` in the log-odds that a Gaussian is a floater."""
 PRIOR = -6.3
-NEEDLESS = (0.001, 0.8, 0.5)
-"""Least use to the photos (as ``LIMITS``), largest share in front of everything and least opacity of a Gaussian that is
-kept although it hangs where a camera was."""
+NEEDLESS = (1.0, 0.8, 0.5)
+"""Least use to the photos, over their noise, largest share in front of everything and least opacity of a Gaussian that
+is kept although it hangs where a camera was."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +96,14 @@ def likely_floaters(suspects: Suspects, photos: TrainingPhotos, on_progress: Cal
     verdicts = verdicts_of(suspects, photos, on_progress)
     figures = evidence(suspects, verdicts)
     odds = PRIOR + sum(EVIDENCE[name] * figure for name, figure in figures.items())
-    likely = np.asarray(suspects.suspected & ((odds > 0.0) | needless(suspects, verdicts, figures)))
+    veils = needless(suspects, verdicts, figures)
+    likely = np.asarray(suspects.suspected & ((odds > 0.0) | veils))
     if not likely.any():
         return likely
     done_before = len(LIMITS) * len(photos.compared_photos)
     worth = error_change_in_photos(suspects.gaussians, likely, photos, partial(_after, on_progress, done_before))
-    missed = (worth.better - worth.worse) / _pixels(suspects) > LIMITS[-1][1]
+    use = np.where(veils, NEEDLESS[0] * _noise(suspects), LIMITS[-1][1] * _pixels(suspects))
+    missed = worth.better - worth.worse > use
     return np.asarray(likely & ~(missed & (figures["loose"] == 0.0)))  # a loose one may hide other floaters
 
 
@@ -112,7 +114,7 @@ def needless(suspects: Suspects, verdicts: Verdicts, figures: dict[str, Figures]
     them, but a camera between two others meets them as veils.
     """
     use, floating, opacity = NEEDLESS
-    of_none = (verdicts.better - verdicts.worse) / _pixels(suspects) < use
+    of_none = verdicts.better - verdicts.worse < use * _noise(suspects)
     hanging = (figures["floating"] > floating) & (figures["opacity"] < opacity)
     return np.asarray(suspects.suspected & suspects.sightings.beside & hanging & of_none)
 
@@ -122,10 +124,15 @@ def _pixels(suspects: Suspects) -> Figures:
     return np.asarray(np.maximum(suspects.sightings.compared, np.float32(1.0)))
 
 
+def _noise(suspects: Suspects) -> Figures:
+    """Noise of the summed squared error of the pixels that show each Gaussian."""
+    return np.asarray(PIXEL_NOISE * np.sqrt(_pixels(suspects)))
+
+
 def evidence(suspects: Suspects, verdicts: Verdicts) -> dict[str, Figures]:
     """The features of the logistic regression by name, as in ``EVIDENCE``."""
     suspected, seen = suspects.suspected, suspects.sightings
-    noise = PIXEL_NOISE * np.sqrt(_pixels(suspects))
+    noise = _noise(suspects)
     loose, light = (
         suspected & ~held(suspects.shapes, touch, suspects.ground, suspected) for touch in (LOOSE, LIGHTLY_HELD)
     )

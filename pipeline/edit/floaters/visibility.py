@@ -28,7 +28,7 @@ from splatpipe.pipeline.splat.model.sh import C0
 from splatpipe.pipeline.splat.sky.panorama import Panorama
 
 MIN_VISIBLE_PX = 1e-3  # visible area in one photo, pixels, below which a Gaussian is not seen: less is rounding
-NEAR_SHARE = 0.2  # of the depth where a photo's scene begins: nearer to its camera there is nothing, in any direction
+NEAR_SHARE = 0.3  # of the depth where a photo's scene begins: nearer to its camera there is nothing, in any direction
 BEGINS_PERCENTILE = 5  # of a photo's depths, where its scene begins
 BORDER_SHARE = 0.08  # width of the border as a share of an image's shorter side: seen only there is hardly covered
 IN_FRONT_SHARE = 0.005  # a Gaussian floats if it is that much, relative to the depth, in front of the background,
