@@ -50,7 +50,7 @@ def ran(answer: dict[str, Any]) -> list[str]:
 def plain_reports() -> Iterator[None]:
     """Let commands write their reports without pictures and in this process: for tests that do not look at them."""
 
-    def plain(out: Path, log: Path, *, until_s: float | None = None) -> Path:
+    def plain(out: Path, log: Path, *, until_s: float | None = None, anew: bool = False) -> Path:
         return report.write_report(out, drawn=False)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -307,7 +307,7 @@ def report(out: OutArgument, as_json: JsonOption = False) -> None:
 
     with CommandSummary(out, as_json) as done:
         open_run_folder(out, LINE)
-        path = make_report(out, out / LOG_FILE)
+        path = make_report(out, out / LOG_FILE, anew=True)
         paths = [str(path), str(out / PDF_FILE)]
         done.details = {"outputs": paths}
     for each in paths:

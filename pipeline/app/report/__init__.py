@@ -22,18 +22,20 @@ from splatpipe.pipeline.engine.python_module import python_module
 
 REPORT_FILE = "report.html"
 PDF_FILE = "report.pdf"
+RECORD_FILE = Path("stages", "last-report.json")  # what the next report can take over from this one
 HEAD_BYTES = 4096  # beginning of the page, which contains the digest of its results
 TIMEOUT_S = 600.0  # far more than hundreds of photos take
 MIN_S = 2.0  # minimum time granted: enough for the report without images, even on a busy machine
 POLL_S = 0.02
 
 
-def write_report(out: Path, *, drawn: bool = True) -> Path:
+def write_report(out: Path, *, drawn: bool = True, anew: bool = False) -> Path:
     """Write OUT/report.html and, with images, OUT/report.pdf, each atomically.
 
     Args:
         out: The run's folder; the run may be finished, stopped, failed, or still running.
         drawn: Whether to include charts and images; without them there is no PDF.
+        anew: Whether to make every chapter, also those that the report in OUT has already.
 
     Returns:
         The page's path.
@@ -44,13 +46,19 @@ def write_report(out: Path, *, drawn: bool = True) -> Path:
         RuntimeError: if the PDF cannot be set; the page is there.
     """
     with imports_outside_gc():
+        from splatpipe.pipeline.app.report.facts.last_report import LastReport
         from splatpipe.pipeline.app.report.facts.report_inputs import read_report_inputs
         from splatpipe.pipeline.app.report.page import report_content, report_page, run_labels
 
     inputs = read_report_inputs(out)
-    content = report_content(inputs, drawn=drawn)
+    files = out / REPORT_FILE, out / RECORD_FILE
+    last = LastReport.read(inputs, *files) if drawn and not anew else LastReport(inputs)
+    content = report_content(inputs, drawn=drawn, last=last)
+    page = report_page(inputs, content)
     (out / PDF_FILE).unlink(missing_ok=True)  # an earlier run's must not lie beside this page
-    write_durably(out / REPORT_FILE, report_page(inputs, content))
+    write_durably(out / REPORT_FILE, page)
+    if drawn and content["geometry_trouble"] is None:
+        last.keep(page, *files)
     if drawn:
         from splatpipe.pipeline.app.report.pdf import report_pdf
 
@@ -77,7 +85,7 @@ def is_current(out: Path) -> bool:
     return is_whole and f'<meta name="splatpipe-results" content="{digest}">'.encode() in head
 
 
-def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
+def make_report(out: Path, log: Path, *, until_s: float | None = None, anew: bool = False) -> Path:
     """Write OUT/report.html and OUT/report.pdf in a separate process.
 
     Args:
@@ -85,6 +93,7 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
         log: File for its error output.
         until_s: ``time.monotonic()`` by which it must finish: a page without images is then written first, and kept
             if there is no time for the full one. None: no limit.
+        anew: As for ``write_report``.
 
     Returns:
         The page's path.
@@ -92,8 +101,8 @@ def make_report(out: Path, log: Path, *, until_s: float | None = None) -> Path:
     Raises:
         MachineError: if it could not be written.
     """
-    hurry = [] if until_s is None else ["--hurry"]
-    command = python_module("splatpipe.pipeline.app.report", str(out), str(os.getpid()), *hurry)
+    flags = ["--hurry"] * (until_s is not None) + ["--anew"] * anew
+    command = python_module("splatpipe.pipeline.app.report", str(out), str(os.getpid()), *flags)
     path = out / REPORT_FILE
     before = _stamp(path)
     began_s = time.monotonic()
@@ -126,8 +135,8 @@ def _run(command: Sequence[str], log: IO[bytes], over: Callable[[], bool], out: 
     finally:
         process.kill()
         code = process.wait()
-        for name in (REPORT_FILE, PDF_FILE):
-            remove_unfinished(out, name, process.pid)
+        for path in (out / REPORT_FILE, out / PDF_FILE, out / RECORD_FILE):
+            remove_unfinished(path.parent, path.name, process.pid)
     return code
 
 

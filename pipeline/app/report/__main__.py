@@ -1,4 +1,4 @@
-"""The process that writes a report: `python -m splatpipe.pipeline.app.report OUT PARENT [--hurry]`."""
+"""The process that writes a report: `python -m splatpipe.pipeline.app.report OUT PARENT [--hurry] [--anew]`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def main() -> None:
     out = Path(sys.argv[1])
     if "--hurry" in sys.argv[3:]:
         write_report(out, drawn=False)
-    write_report(out)
+    write_report(out, anew="--anew" in sys.argv[3:])
 
 
 if __name__ == "__main__":

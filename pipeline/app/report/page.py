@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from splatpipe.pipeline.app.report.chapters.georeferencing import georeferencing
 from splatpipe.pipeline.app.report.chapters.processing import files_chapter, messages_chapter, processing_chapter
 from splatpipe.pipeline.app.report.chapters.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.chapters.training import training_chapter, views_chapter
+from splatpipe.pipeline.app.report.facts.last_report import Chapter, LastReport
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs, results_digest
 from splatpipe.pipeline.app.report.facts.wording import count, duration, judged_of, judged_size, length, moment, number
 from splatpipe.pipeline.app.report.verdict import judge
@@ -23,22 +25,43 @@ if TYPE_CHECKING:
     from splatpipe.pipeline.app.report.charts.geometry import Geometry
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
+Make = Callable[[ReportInputs], Chapter | None]
 
 
-def report_content(inputs: ReportInputs, *, drawn: bool) -> dict[str, Any]:
+def report_content(inputs: ReportInputs, *, drawn: bool, last: LastReport | None = None) -> dict[str, Any]:
     """What a report says: the values for the template of the page, and for that of the PDF.
 
     Args:
         inputs: The report's inputs.
         drawn: Whether to include charts and images; without them it is quick.
+        last: The last report, whose chapters are taken over if they would be the same; None to draw all of them.
     """
-    if not drawn:
-        return _content(inputs, None, None, drawn=False)
-    from splatpipe.pipeline.app.report.charts.drawing import styled
+    last, model = LastReport(inputs) if last is None else last, _Model(inputs, drawn=drawn)
 
-    geometry, trouble = _geometry(inputs)
-    with styled():
-        return _content(inputs, geometry, trouble, drawn=True)
+    def chapter(name: str, make: Make, *, charts: bool = True) -> Chapter | None:
+        make_drawn = _in_style(make) if charts else make
+        return _guarded(lambda: last.chapter(name, make_drawn) if drawn else make(inputs))
+
+    content: dict[str, Any] = {
+        "name": _name(inputs),
+        "photos_dir": "" if inputs.photos_dir is None else inputs.photos_dir.name,
+        "began": moment(inputs.history.began_s) if inputs.history.began_s else "",
+        "version": importlib.metadata.version("splatpipe"),
+        "verdict": judge(inputs),
+        "key_figures": _guarded(lambda: {"cards": _cards(inputs)}),
+        "drawn": drawn,
+        "results": results_digest(inputs) if drawn else "",
+        "capture": chapter("capture", lambda seen: _capture(seen, model, drawn=drawn)),
+        "registration": chapter("registration", lambda seen: _registration(seen, model, drawn=drawn)),
+        "georeferencing": chapter("georeferencing", lambda seen: georeferencing_chapter(seen, model.geometry)),
+        "training": chapter("training", lambda seen: training_chapter(seen, drawn=drawn)),
+        "views": chapter("views", lambda seen: views_chapter(seen, drawn=drawn)),
+        "surfaces": chapter("surfaces", lambda seen: surfaces_chapter(seen, drawn=drawn), charts=False),
+        "processing": _guarded(lambda: processing_chapter(inputs, drawn=drawn)),
+        "files": _guarded(lambda: files_chapter(inputs)),
+        "messages": _guarded(lambda: messages_chapter(inputs)),
+    }
+    return content | {"geometry_trouble": model.trouble}
 
 
 def report_page(inputs: ReportInputs, content: Mapping[str, Any]) -> str:
@@ -62,43 +85,30 @@ def _name(inputs: ReportInputs) -> str:
     return inputs.out.resolve().name or str(inputs.out)
 
 
-def _content(inputs: ReportInputs, geometry: Geometry | None, trouble: str | None, *, drawn: bool) -> dict[str, Any]:
-    return {
-        "name": _name(inputs),
-        "photos_dir": "" if inputs.photos_dir is None else inputs.photos_dir.name,
-        "began": moment(inputs.history.began_s) if inputs.history.began_s else "",
-        "version": importlib.metadata.version("splatpipe"),
-        "verdict": judge(inputs),
-        "key_figures": _guarded(lambda: {"cards": _cards(inputs)}),
-        "drawn": drawn,
-        "results": results_digest(inputs) if drawn else "",
-        "geometry_trouble": trouble,
-        "capture": _guarded(lambda: capture_chapter(inputs, geometry, drawn=drawn) if _checked(inputs) else None),
-        "registration": _guarded(
-            lambda: registration_chapter(inputs, geometry, drawn=drawn) if _matched(inputs) else None
-        ),
-        "georeferencing": _guarded(lambda: georeferencing_chapter(inputs, geometry)),
-        "training": _guarded(lambda: training_chapter(inputs, drawn=drawn)),
-        "views": _guarded(lambda: views_chapter(inputs, drawn=drawn)),
-        "surfaces": _guarded(lambda: surfaces_chapter(inputs, drawn=drawn)),
-        "processing": _guarded(lambda: processing_chapter(inputs, drawn=drawn)),
-        "files": _guarded(lambda: files_chapter(inputs)),
-        "messages": _guarded(lambda: messages_chapter(inputs)),
-    }
-
-
 def run_labels(inputs: ReportInputs) -> PathLabels:
     """The labels that replace this machine's folders in a report."""
     options = {} if inputs.config is None else inputs.config.model_dump(mode="json")
     return PathLabels.of(inputs.out, inputs.photos_dir, options)
 
 
-def _checked(inputs: ReportInputs) -> bool:
-    return "ingest" in inputs.artifacts
+def _capture(inputs: ReportInputs, model: _Model, *, drawn: bool) -> Chapter | None:
+    return capture_chapter(inputs, model.geometry, drawn=drawn) if "ingest" in inputs.artifacts else None
 
 
-def _matched(inputs: ReportInputs) -> bool:
-    return any(name in inputs.artifacts for name in ("features", "matches", "sparse"))
+def _registration(inputs: ReportInputs, model: _Model, *, drawn: bool) -> Chapter | None:
+    if not any(name in inputs.artifacts for name in ("features", "matches", "sparse")):
+        return None
+    return registration_chapter(inputs, model.geometry, drawn=drawn)
+
+
+def _in_style(make: Make) -> Make:
+    def styled_chapter(inputs: ReportInputs) -> Chapter | None:
+        from splatpipe.pipeline.app.report.charts.drawing import styled
+
+        with styled():
+            return make(inputs)
+
+    return styled_chapter
 
 
 def _guarded(build: Callable[[], dict[str, Any] | None]) -> dict[str, Any] | None:
@@ -109,18 +119,32 @@ def _guarded(build: Callable[[], dict[str, Any] | None]) -> dict[str, Any] | Non
         return {"trouble": f"This part could not be read: {type(error).__name__}: {error}"}
 
 
-def _geometry(inputs: ReportInputs) -> tuple[Geometry | None, str | None]:
-    """The sparse model's geometry, in world coordinates if georeferenced; or the error if it cannot be read."""
-    frame = inputs.part("georef.frame")
-    path = inputs.part("georef.model") if frame is not None else inputs.part("sparse.model")
-    if path is None:
-        return None, None
-    from splatpipe.pipeline.app.report.charts.geometry import read_geometry
+class _Model:
+    """The sparse model, read when the first chapter shows it.
 
-    try:
-        return read_geometry(path, frame), None
-    except (OSError, ValueError, RuntimeError, KeyError, TypeError, SplatpipeError) as error:
-        return None, f"The sparse model could not be read, so there are no maps: {error}"
+    Args:
+        inputs: The report's inputs.
+        drawn: Whether it is shown at all.
+    """
+
+    def __init__(self, inputs: ReportInputs, *, drawn: bool) -> None:
+        self._inputs, self._drawn = inputs, drawn
+        self.trouble: str | None = None  # why it cannot be read
+
+    @cached_property
+    def geometry(self) -> Geometry | None:
+        """Its geometry, in world coordinates if georeferenced; None without a model that can be read."""
+        frame = self._inputs.part("georef.frame")
+        path = self._inputs.part("georef.model") if frame is not None else self._inputs.part("sparse.model")
+        if path is None or not self._drawn:
+            return None
+        from splatpipe.pipeline.app.report.charts.geometry import read_geometry
+
+        try:
+            return read_geometry(path, frame)
+        except (OSError, ValueError, RuntimeError, KeyError, TypeError, SplatpipeError) as error:
+            self.trouble = f"The sparse model could not be read, so there are no maps: {error}"
+            return None
 
 
 def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:

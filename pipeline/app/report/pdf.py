@@ -6,6 +6,7 @@ The same content gives the same bytes: no date but the run's, no fonts but those
 from __future__ import annotations
 
 import base64
+import importlib.util
 import json
 import math
 import tempfile
@@ -22,6 +23,7 @@ from splatpipe.pipeline.app.path_labels import PathLabels
 from splatpipe.pipeline.engine.files.output_file import write_file
 
 TEMPLATE = Path(__file__).resolve().parent / "templates" / "report.typ"
+FONTS = Path("mpl-data", "fonts", "ttf")
 MAX_MARKS = 14  # cuttings, the worst mark of each of the worst points
 MAX_VIEWS = 3  # held-out photos with pictures: the worst ones, and the best
 # Most entries of each list, by chapter; how many are left out is stated.
@@ -55,7 +57,6 @@ def report_pdf(content: Mapping[str, Any], places: PathLabels) -> bytes:
         OSError: if there is no room for temporary files.
     """
     import typst
-    from matplotlib import get_data_path
 
     with tempfile.TemporaryDirectory(prefix="splatpipe-report-") as name:
         folder = Path(name)
@@ -63,11 +64,17 @@ def report_pdf(content: Mapping[str, Any], places: PathLabels) -> bytes:
         write_file(folder / "report.json", json.dumps(values))
         template = folder / TEMPLATE.name
         write_file(template, TEMPLATE.read_bytes())
-        fonts = [str(Path(get_data_path()) / "fonts" / "ttf")]
+        fonts = [str(place / FONTS) for place in _folders_of("matplotlib")]
         compiler = typst.Compiler(str(template), str(folder), fonts, ignore_system_fonts=True)
         pdf = compiler.compile(format="pdf")
     assert isinstance(pdf, bytes)
     return pdf
+
+
+def _folders_of(package: str) -> list[Path]:
+    """The folders of a package, without importing it: that would take longer than the whole PDF."""
+    found = importlib.util.find_spec(package)
+    return [] if found is None else [Path(place) for place in found.submodule_search_locations or ()]
 
 
 def shortened(content: Mapping[str, Any]) -> dict[str, Any]:

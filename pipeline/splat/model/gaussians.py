@@ -16,6 +16,7 @@ PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 """The parameters' names, in the order of the fields."""
 
 _ROWS_AT_ONCE = 1 << 16  # torch.isfinite makes a copy
+_ORTHONORMAL = 1e-12  # off a rotation's Gramian: SciPy makes what is farther off orthonormal
 
 
 @dataclass(eq=False)
@@ -187,8 +188,30 @@ def multiply_quats(a: Float[Tensor, "... 4"], b: Float[Tensor, "... 4"]) -> Floa
 
 
 def quat_from_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
-    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix."""
-    from scipy.spatial.transform import Rotation  # half a CPU second, which other commands need not pay
+    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
 
-    x, y, z, w = Rotation.from_matrix(rotation.detach().cpu().double().numpy()).as_quat(canonical=True)
+    The largest component is found without a difference of near numbers, and the others divided by it: S. W. Shepperd,
+    "Quaternion from rotation matrix", Journal of Guidance and Control 1 (1978). SciPy takes the same steps, to the bit,
+    but to load it takes half a CPU second; a half-turn and what is not quite orthonormal are left to it.
+    """
+    matrix = rotation.detach().cpu().double()
+    m = matrix.tolist()
+    trace = m[0][0] + m[1][1] + m[2][2]
+    diagonal = [m[0][0], m[1][1], m[2][2], trace]
+    i = diagonal.index(max(diagonal))
+    if i == 3:
+        quat = [m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1], 1.0 + trace]  # x, y, z, w
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        parts = {i: 1.0 - trace + 2.0 * m[i][i], j: m[j][i] + m[i][j], k: m[k][i] + m[i][k]}
+        quat = [parts[0], parts[1], parts[2], m[k][j] - m[j][k]]
+    skew = float((matrix @ matrix.T - torch.eye(3, dtype=torch.float64)).abs().max())
+    if quat[3] != 0.0 and skew < _ORTHONORMAL:
+        x, y, z, w = quat
+        length = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w)
+        x, y, z, w = x / length, y / length, z / length, w / length
+    else:
+        from scipy.spatial.transform import Rotation
+
+        x, y, z, w = Rotation.from_matrix(matrix.numpy()).as_quat(canonical=True)
     return torch.tensor([w, x, y, z], dtype=rotation.dtype, device=rotation.device)

@@ -1,7 +1,9 @@
 """The Gaussians' container and its change of frame."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from splatpipe.pipeline.splat.model.gaussians import Gaussians, multiply_quats, quat_from_rotation
 from splatpipe.pipeline.splat.model.sh import eval_sh
@@ -40,6 +42,17 @@ def test_quaternion_of_a_matrix_turns_like_it(axis_angle):
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     rotation = torch.linalg.matrix_exp(skew)
     torch.testing.assert_close(rotation_of(quat_from_rotation(rotation)), rotation, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 3.0])
+@pytest.mark.parametrize("off", [0.0, 1e-9])
+def test_quaternion_of_a_matrix_has_scipys_bits(size: float, off: float) -> None:
+    generator = np.random.default_rng(7)
+    turns = Rotation.from_rotvec(size * generator.normal(size=(200, 3))).as_matrix()
+    half_turns = np.stack([np.diag([1.0, -1.0, -1.0]), np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])])
+    for matrix in np.concatenate([turns, half_turns]) + off * generator.normal(size=(202, 3, 3)):
+        x, y, z, w = Rotation.from_matrix(matrix).as_quat(canonical=True)
+        assert quat_from_rotation(torch.from_numpy(matrix)).tolist() == [w, x, y, z]
 
 
 def test_quaternion_product_composes_rotations():

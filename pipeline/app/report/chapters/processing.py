@@ -188,7 +188,7 @@ def _options(options: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _charts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    from splatpipe.pipeline.app.report.charts.charts import stage_bars
+    from splatpipe.pipeline.app.report.charts.bars import stage_bars
 
     times = [(row["name"], row["seconds"]) for row in rows if row["seconds"] is not None]
     memory = [(row["name"], row["memory"] / 1e9) for row in rows if row["memory"]]

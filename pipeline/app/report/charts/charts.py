@@ -1,4 +1,4 @@
-"""The report's charts: maps, registration, training, held-out photos, time. Each is an SVG element."""
+"""The report's charts: maps, registration, training, held-out photos. Each is an SVG element."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from splatpipe.pipeline.app.report.charts.drawing import (
     FAINT,
     GREEN,
     GREY,
-    HEIGHT,
     INK,
     LINE,
     ORANGE,
@@ -238,16 +237,6 @@ def view_bars(views: Sequence[tuple[str, float]], unit: str) -> Markup:
     axes.set_ylabel(f"PSNR ({unit})")
     axes.legend(fontsize=8, loc="upper left")
     return to_svg(figure, "PSNR of the held-out photos")
-
-
-def stage_bars(rows: Sequence[tuple[str, float]], label: str, title: str) -> Markup:
-    """Horizontal bar chart of one value per stage."""
-    figure, axes = new_figure(WIDTH, HEIGHT * max(0.4, len(rows) / 11))
-    names, values = [name for name, _ in rows][::-1], [value for _, value in rows][::-1]
-    axes.barh(names, values, color=BLUE, height=0.7)
-    axes.set_xlabel(label)
-    axes.grid(visible=False, axis="y")
-    return to_svg(figure, title)
 
 
 def _draw_points(axes: Axes, geometry: Geometry) -> None:

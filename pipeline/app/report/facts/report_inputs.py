@@ -119,7 +119,6 @@ def results_digest(inputs: ReportInputs) -> str:
     history = inputs.history
     if history.exit_code or not all(stage.state in ("finished", "reused") for stage in history.stages.values()):
         return ""
-    measured = [inputs.out / VOLUMES, *sorted((inputs.out / SECTIONS).glob("*"))]
     facts = [
         importlib.metadata.version("splatpipe"),
         inputs.out.resolve().name,
@@ -127,9 +126,15 @@ def results_digest(inputs: ReportInputs) -> str:
         None if inputs.config is None else inputs.config.model_dump(mode="json"),
         {name: artifact.key for name, artifact in inputs.artifacts.items()},
         [(file.name, file.size, file.current) for file in inputs.deliverables],
-        [(path.name, path.stat().st_mtime_ns) for path in measured if path.is_file()],
+        [(path.name, path.stat().st_mtime_ns) for path in measured_files(inputs)],
     ]
     return hashlib.sha256(json.dumps(facts).encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def measured_files(inputs: ReportInputs) -> list[Path]:
+    """The files of the measurements in OUT, which no stage made."""
+    places = [inputs.out / VOLUMES, *sorted((inputs.out / SECTIONS).glob("*"))]
+    return [path for path in places if path.is_file()]
 
 
 def _configuration(run: RunFolder) -> tuple[LineConfig | None, Path | None]:
