@@ -28,8 +28,8 @@ struct LossJob {
 };
 
 constexpr int kLossTileRows = 128;
-constexpr int kLossTileCols = 256;
-constexpr std::size_t kLossScratch = 116'000;  // floats a tile works in
+constexpr int kLossTileCols = 192;
+constexpr std::size_t kLossScratch = 120'000;  // floats a tile works in
 
 // Sums over a tile's counting pixels and channels.
 struct LossSums {
