@@ -151,7 +151,7 @@ BLOCKS = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=15,
+    version=16,
     config=TrainConfig,
     reads=(
         "undistort.dataset",

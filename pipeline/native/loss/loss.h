@@ -38,7 +38,7 @@ struct LossSums {
 };
 
 struct LossKernels {
-    // The gradient of a tile's pixels, and their sums. scratch: kLossScratch floats, aligned to 64 bytes.
+    // The gradient of a tile's pixels, and their sums. scratch: kLossScratch floats, set once, aligned to 64 bytes.
     LossSums (*tile)(const LossJob& job, const LossTile& tile, float* scratch);
 };
 

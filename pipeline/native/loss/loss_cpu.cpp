@@ -25,8 +25,8 @@ constexpr int kReach = kRadius * kChannels;  // floats on each side of a window'
 constexpr int kBand = 8;
 // Rows kept, by row % kRing: those between a gradient's window and the one that the next band's means need.
 constexpr int kRing = 28;
-constexpr int kAlign = 16;          // floats in a cache line
-constexpr int kLead = 2 * kAlign;   // of a row, before the tile's first column
+constexpr int kAlign = 16;         // floats in a cache line
+constexpr int kLead = 2 * kAlign;  // of a row, before the tile's first column
 static_assert(kLead >= 2 * kReach, "a window's means reach twice as far");
 constexpr int kStride = (kLead + kLossTileCols * kChannels + 2 * kReach + kAlign - 1) / kAlign * kAlign + kAlign;
 
@@ -51,11 +51,11 @@ SPLAT_INLINE Window window_of(const float* taps) {
 // Rings of kRing rows, bands of kBand rows, and single rows, of kStride floats each. Vectors reach beside the columns:
 // what is there, of whatever image, is processed, too, and never gets into a column.
 struct Scratch {
-    float *u, *v;    // rings
-    float* maps[3];  // a, b_u, b_v, times 1/D: rings
-    float* means[4]; // of u, u^2, v, v^2, or of the maps, down the columns: bands
+    float *u, *v;     // rings
+    float* maps[3];   // a, b_u, b_v, times 1/D: rings
+    float* means[4];  // of u, u^2, v, v^2, or of the maps, down the columns: bands
     float *dissimilarity, *counts, *inside;
-    float* share;    // D along a row
+    float* share;  // D along a row
 };
 
 Scratch divide(float* memory) {
@@ -181,8 +181,7 @@ SPLAT_INLINE Floats blur_along(const float* p, const Window& window) {
 SPLAT_INLINE Floats blur_along(const float* p, const Window& window) {
     Floats sum = window.at[0] * load(p);
 #pragma GCC unroll 5
-    for (int d = 1; d <= kRadius; ++d)
-        sum = fma(window.at[d], load(p - d * kChannels) + load(p + d * kChannels), sum);
+    for (int d = 1; d <= kRadius; ++d) sum = fma(window.at[d], load(p - d * kChannels) + load(p + d * kChannels), sum);
     return sum;
 }
 #endif
