@@ -7,7 +7,7 @@ import ctypes
 import gc
 from collections.abc import Iterator
 
-# Parameters of mallopt, from malloc.h; the limit is glibc's own largest, to which it raises it as such blocks are freed.
+# Parameters of mallopt, from malloc.h. The limit is glibc's largest, to which it goes itself as such blocks are freed.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 _LARGEST_IN_HEAP = 32 << 20
 
