@@ -141,7 +141,7 @@ INITIALIZE = Stage(
 )
 BLOCKS = Stage(
     "blocks",
-    version=9,
+    version=10,
     config=BlocksConfig,
     reads=("undistort.dataset", "split.views", "initialize.splat", "georef.boundary"),
     parts={"plan": "blocks.json", "coarse": "coarse", "prospects": "prospects"},
@@ -151,7 +151,7 @@ BLOCKS = Stage(
 )
 TRAIN = Stage(
     "train",
-    version=15,
+    version=16,
     config=TrainConfig,
     reads=(
         "undistort.dataset",

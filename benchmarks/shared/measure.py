@@ -29,6 +29,7 @@ from commands import benchmark
 from rasterizing import contributing_pairs, raster_alone
 from tables import Row, console, print_table
 
+from splatpipe.pipeline.engine.heap import keep_freed_heap
 from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.runs.runner import versions
 from splatpipe.pipeline.engine.stage import Inputs
@@ -162,6 +163,7 @@ def time_case(case: TimingCase) -> Row:
     Memory is the process's peak above what it had with its libraries imported, as measured by this call.
     """
     before = restart_peak()
+    keep_freed_heap()  # as a training does
     config = TrainConfig(
         iterations=PUBLISHED_ITERATIONS,
         sh_degree=case.sh_degree,

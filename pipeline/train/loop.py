@@ -10,6 +10,7 @@ from pathlib import Path
 
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.output_file import write_file
+from splatpipe.pipeline.engine.heap import keep_freed_heap
 from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import JSON, Inputs, Reporter, Summary
 from splatpipe.pipeline.geometry.plan_area import read_model_area
@@ -164,6 +165,7 @@ def run_training(setup: TrainingSetup, out: Path, report: Reporter) -> TrainStat
         MachineError, KeyboardInterrupt: as ``run``.
     """
     plan, device = setup.plan, setup.device
+    keep_freed_heap()  # an iteration allocates what the last one freed
     state = resume(out / CHECKPOINT, setup, report)
     first, history, seconds = 1, History(), 0.0
     if state is not None:

@@ -28,8 +28,8 @@ struct LossJob {
 };
 
 constexpr int kLossTileRows = 128;
-constexpr int kLossTileCols = 256;
-constexpr std::size_t kLossScratch = 116'000;  // floats a tile works in
+constexpr int kLossTileCols = 192;
+constexpr std::size_t kLossScratch = 120'000;  // floats a tile works in
 
 // Sums over a tile's counting pixels and channels.
 struct LossSums {
@@ -38,7 +38,7 @@ struct LossSums {
 };
 
 struct LossKernels {
-    // The gradient of a tile's pixels, and their sums. scratch: kLossScratch floats, aligned to 64 bytes.
+    // The gradient of a tile's pixels, and their sums. scratch: kLossScratch floats, set once, aligned to 64 bytes.
     LossSums (*tile)(const LossJob& job, const LossTile& tile, float* scratch);
 };
 
