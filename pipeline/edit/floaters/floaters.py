@@ -46,7 +46,7 @@ EVIDENCE = {
 }
 """Weight of each feature of ``evidence`` in the log-odds that a Gaussian is a floater."""
 PRIOR = -6.3
-NEEDLESS = (1.0, 0.8, 0.5)
+NEEDLESS = (1.0, 0.5, 0.5)
 """Least use to the photos, over their noise, largest share in front of everything and least opacity of a Gaussian that
 is kept although it hangs where a camera was."""
 
