@@ -189,8 +189,10 @@ def _program_facts() -> JSON:
 
 
 def _file_facts(folder: Path) -> JSON:
+    """Without the ctime, which changes when a file is linked to as a deliverable."""
     files = (path for path in sorted(folder.rglob("*")) if not path.is_dir())
-    return [[path.relative_to(folder).as_posix(), *_stamp(path.lstat())] for path in files]
+    found = [(path.relative_to(folder).as_posix(), path.lstat()) for path in files]
+    return [[name, status.st_size, status.st_mtime_ns, status.st_ino] for name, status in found]
 
 
 def _stamp(status: os.stat_result) -> list[JSON]:
