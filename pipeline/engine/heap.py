@@ -19,7 +19,7 @@ def return_free_heap() -> None:
 
 
 def keep_freed_heap() -> None:
-    """Keep up to 64 MB of freed heap memory: to get a page from the system again takes about a microsecond.
+    """Keep up to 64 MB of freed heap memory: getting its pages from the system again takes time in every iteration.
 
     ``return_free_heap`` returns it all the same. Does nothing with C libraries other than glibc.
     """
