@@ -84,6 +84,25 @@ class Step:
         return (now_s - self.began_s) * (total - done) / (done - self.done)
 
 
+@dataclass
+class Display:
+    """What is shown of a stage that runs; another may run beside it.
+
+    Attributes:
+        began_s: When it started, ``time.monotonic()``.
+        printed_s: When its progress was last printed as a line.
+        step: The step it is in.
+        done: How much of that is done.
+        task: Its bar on a terminal.
+    """
+
+    began_s: float
+    printed_s: float = 0.0
+    step: Step = Step()
+    done: float = 0.0
+    task: TaskID | None = None
+
+
 class RunConsole:
     """Shows a run's events on stderr; a sink for the runner."""
 
@@ -91,10 +110,7 @@ class RunConsole:
         self._console = Console(file=sys.stderr, highlight=False, emoji=False)
         self._order: list[str] = []
         self._live: Progress | None = None
-        self._task: TaskID | None = None
-        self._stage_started_s = time.monotonic()
-        self._plain_printed_s = 0.0
-        self._step, self._done = Step(), 0.0
+        self._displays: dict[str, Display] = {}
         self._shards = ShardTimes()
 
     def __call__(self, event: Event) -> None:
@@ -103,7 +119,8 @@ class RunConsole:
             show(event.stage, event.data)
 
     def close(self) -> None:
-        """Remove the bar, so that further output starts on its own line."""
+        """Remove the bars, so that further output starts on its own line."""
+        self._displays.clear()
         if self._live is not None:
             self._live.stop()
             self._live = None
@@ -113,13 +130,18 @@ class RunConsole:
         self._order = list(data["stages"])
 
     def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
-        self._stage_started_s = self._plain_printed_s = time.monotonic()
-        self._step, self._done = Step(), 0.0
+        now_s = time.monotonic()
+        display = self._displays[stage] = Display(now_s, now_s)
         self._shards.begin(stage, None if stage in self._order else data.get("shard"))  # None: the shard is run alone
         if not self._console.is_terminal:
             self._console.print(f"{self._label(stage)} started ({data['reason']})", markup=False)
             return
-        self._live = Progress(
+        if self._live is None:
+            self._live = self._bars()
+        display.task = self._live.add_task(escape(f"{self._label(stage)} ({data['reason']})"), total=None, unit="")
+
+    def _bars(self) -> Progress:
+        bars = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
@@ -131,32 +153,33 @@ class RunConsole:
             transient=True,
             speed_estimate_period=60,
         )
-        self._live.start()
-        self._task = self._live.add_task(escape(f"{self._label(stage)} ({data['reason']})"), total=None, unit="")
+        bars.start()
+        return bars
 
     def _progress(self, stage: str, data: Mapping[str, JSON]) -> None:
         done, total, what, unit = data["done"], data["total"], str(data["what"]), str(data["unit"])
         now_s = time.monotonic()
-        begins = what != self._step.what or done < self._done
-        self._done = done
+        display = self._displays.setdefault(stage, Display(now_s))
+        begins = what != display.step.what or done < display.done
+        display.done = done
         if begins:
-            self._step = Step(what, now_s, done)
-        of_all = self._shards.left(now_s - self._stage_started_s, done, total) if unit == "iterations" else ""
-        if self._live is not None and self._task is not None:
+            display.step = Step(what, now_s, done)
+        of_all = self._shards.left(stage, now_s - display.began_s, done, total) if unit == "iterations" else ""
+        if self._live is not None and display.task is not None:
             description = escape(f"{self._label(stage)} {what}{of_all}")
             if begins:
-                self._live.reset(self._task, total=total)
-            self._live.update(self._task, completed=done, total=total, description=description, unit=unit)
-        elif not self._console.is_terminal and now_s - self._plain_printed_s > PLAIN_INTERVAL_S:
-            self._plain_printed_s = now_s
-            left_s = self._step.left_s(now_s, done, total)
+                self._live.reset(display.task, total=total)
+            self._live.update(display.task, completed=done, total=total, description=description, unit=unit)
+        elif not self._console.is_terminal and now_s - display.printed_s > PLAIN_INTERVAL_S:
+            display.printed_s = now_s
+            left_s = display.step.left_s(now_s, done, total)
             left = "" if left_s is None else f", about {duration(left_s)} left"
             self._console.print(
                 f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}{left}{of_all}", markup=False
             )
 
     def _stage_finished(self, stage: str, data: Mapping[str, JSON]) -> None:
-        self.close()
+        self._ended(stage)
         self._shards.end(stage, float(data["seconds"]))
         self._line("✓", "green", stage, f"{duration(data['seconds'])}  {sentence(stage, data['summary'])}")
 
@@ -165,8 +188,16 @@ class RunConsole:
         self._line("=", "blue", stage, f"reused  {sentence(stage, data['summary'])}")
 
     def _stage_failed(self, stage: str, data: Mapping[str, JSON]) -> None:
-        self.close()
+        self._ended(stage)
         self._line("✗", "red", stage, str(data["message"]))
+
+    def _ended(self, stage: str) -> None:
+        """Remove a stage's bar; without any, the space for them."""
+        display = self._displays.pop(stage, None)
+        if self._live is not None and display is not None and display.task is not None:
+            self._live.remove_task(display.task)
+            if not self._live.tasks:
+                self.close()
 
     def _note(self, stage: str, data: Mapping[str, JSON]) -> None:
         self._line("·", "cyan", stage, str(data["message"]))
@@ -191,7 +222,7 @@ class ShardTimes:
 
     def __init__(self) -> None:
         self._took: dict[str, dict[str, float]] = {}
-        self._stage, self._after = "", 0
+        self._after: dict[str, int] = {}  # shards that are left after the current one, by stage
 
     def begin(self, stage: str, shard: Mapping[str, int] | None) -> None:
         """Record the start of a stage or of one of its shards.
@@ -200,31 +231,35 @@ class ShardTimes:
             stage: Its name.
             shard: Its number and count; None for the stage's own body.
         """
-        self._stage, self._after = stage_name(stage), 0
+        of = stage_name(stage)
+        self._after[of] = 0
         if shard is not None:
-            took = self._took.get(self._stage, {})
-            later = (f"{self._stage}.{number}" for number in range(shard["number"] + 1, shard["count"] + 1))
-            self._after = sum(name not in took for name in later)
+            took = self._took.get(of, {})
+            later = (f"{of}.{number}" for number in range(shard["number"] + 1, shard["count"] + 1))
+            self._after[of] = sum(name not in took for name in later)
 
     def end(self, stage: str, seconds: float) -> None:
         """Record the end of a shard."""
         if stage != stage_name(stage):
             self._took.setdefault(stage_name(stage), {})[stage] = seconds
 
-    def left(self, seconds: float, done: float, total: float) -> str:
+    def left(self, stage: str, seconds: float, done: float, total: float) -> str:
         """The approximate time left for all shards, in words; empty for the last one, and if unknown.
 
         Args:
+            stage: Its stage, or the current shard.
             seconds: Elapsed time of the current shard.
             done: Its work done.
             total: Its total work.
         """
-        if not self._after or not done or not total:
+        of = stage_name(stage)
+        after = self._after.get(of, 0)
+        if not after or not done or not total:
             return ""
         whole = seconds * total / done
-        each = [*self._took.get(self._stage, {}).values(), whole]
-        left = whole - seconds + self._after * sum(each) / len(each)
-        return f", {duration(left)} including the {self._after} remaining"
+        each = [*self._took.get(of, {}).values(), whole]
+        left = whole - seconds + after * sum(each) / len(each)
+        return f", {duration(left)} including the {after} remaining"
 
 
 def escape(text: str) -> str:

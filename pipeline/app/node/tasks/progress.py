@@ -32,8 +32,9 @@ class RunProgress:
             self._at = path.stat().st_size
         self._order: list[str] = []
         self._done: set[str] = set()
-        self._stage, self._fraction = "", 0.0
-        self.what = ""
+        self._fractions: dict[str, float] = {}  # of the stages that run, one or two
+        self._whats: dict[str, str] = {}
+        self._stage = ""
         self.message, self.hint = "", ""
         self.moved_s = time.monotonic()
 
@@ -43,21 +44,23 @@ class RunProgress:
         whole = sum(self._weight(name) for name in self._order)
         if not whole:
             return 0.0
-        done = sum(self._weight(name) for name in self._order if name in self._done)
-        if self._stage not in self._done:
-            done += self._fraction * self._weight(self._stage)
-        return min(MOST, 100.0 * done / whole)
+        return min(MOST, max(0.0, 100.0 * (whole - self.left_s) / whole))
 
     @property
     def left_s(self) -> float:
         """Forecast seconds left."""
-        rest = sum(self._weight(name) for name in self._order if name not in self._done)
-        return max(0.0, rest - (self._fraction * self._weight(self._stage) if self._stage not in self._done else 0.0))
+        rest = (name for name in self._order if name not in self._done)
+        return sum(self._weight(name) * (1.0 - self._fractions.get(name, 0.0)) for name in rest)
 
     @property
     def stage(self) -> str:
-        """The stage that is running; empty before the first."""
-        return self._stage
+        """The stage that is running, the first in order if another runs beside it; empty before the first."""
+        return next((name for name in self._order if name in self._fractions), self._stage)
+
+    @property
+    def what(self) -> str:
+        """What it is doing."""
+        return self._whats.get(self.stage, "")
 
     def read(self) -> None:
         """Read the events that were added."""
@@ -84,13 +87,16 @@ class RunProgress:
         name = stage_name(event.stage)
         if event.kind == "run_started":
             self._order, self._done = [str(each) for each in event.data["stages"]], set()
+            self._fractions, self._whats, self._stage = {}, {}, ""
         elif event.kind == "stage_started" and name == event.stage:
-            self._stage, self._fraction, self.what = name, 0.0, ""
-        elif event.kind in ("stage_finished", "stage_reused") and name == event.stage:
-            self._done.add(name)
-        elif event.kind == "progress" and name == self._stage:
-            self._fraction = min(1.0, max(0.0, float(event.data["done"]) / float(event.data["total"])))
-            self.what = str(event.data["what"])
+            self._stage, self._fractions[name], self._whats[name] = name, 0.0, ""
+        elif event.kind in ("stage_finished", "stage_reused", "stage_failed") and name == event.stage:
+            self._fractions.pop(name, None)
+            if event.kind != "stage_failed":
+                self._done.add(name)
+        elif event.kind == "progress" and name in self._fractions:
+            self._fractions[name] = min(1.0, max(0.0, float(event.data["done"]) / float(event.data["total"])))
+            self._whats[name] = str(event.data["what"])
         elif event.kind == "run_finished":
             self.message, self.hint = str(event.data.get("message", "")), str(event.data.get("hint", ""))
 

@@ -84,6 +84,24 @@ def test_progress_follows_the_forecast_of_the_stages(tmp_path: Path) -> None:
     assert progress.message == ""
 
 
+def test_progress_is_that_of_both_stages_where_one_runs_beside_another(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    progress = RunProgress(path, {"train": 60.0, "clean": 10.0, "depths": 30.0})
+    events = [_event("run_started", stages=["train", "clean", "depths"])]
+    events += [_event("stage_started", name) for name in ("train", "depths")]
+    events += [_event("progress", name, done=1, total=2, what=f"{name}ing", unit="") for name in ("train", "depths")]
+    path.write_text("".join(events))
+    progress._at = 0  # as if it had been followed from the start
+    progress.read()
+    assert (progress.percent, progress.left_s) == (pytest.approx(45.0), pytest.approx(55.0))
+    assert (progress.stage, progress.what) == ("train", "training")
+    with path.open("a") as file:
+        file.write(_event("stage_finished", "train") + _event("stage_finished", "depths"))
+        file.write(_event("stage_started", "clean"))
+    progress.read()
+    assert (progress.percent, progress.stage, progress.what) == (pytest.approx(90.0), "clean", "")
+
+
 def test_events_that_nobody_of_ours_wrote_are_passed_over(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     progress = RunProgress(path, {"train": float("1e9")})
