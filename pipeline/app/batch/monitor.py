@@ -17,6 +17,7 @@ from splatpipe.pipeline.app.batch.jobs.slurm_queue import read_queue
 from splatpipe.pipeline.app.batch.pages.pictures import capture_picture
 from splatpipe.pipeline.app.batch.pages.state import BatchState, CaptureState, Level
 from splatpipe.pipeline.app.report import REPORT_FILE
+from splatpipe.pipeline.app.report.facts.overlap import overlap_s
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs, read_report_inputs
 from splatpipe.pipeline.app.report.facts.run_history import read_history
 from splatpipe.pipeline.app.report.verdict import judge
@@ -232,7 +233,8 @@ def read_facts(out: Path, name: str, judged: bool) -> CaptureFacts:
     try:
         inputs = read_report_inputs(folder)
         verdict = judge(inputs) if judged else None
-        seconds = sum(float(artifact.manifest["seconds"]) for artifact in inputs.artifacts.values())
+        manifests = [artifact.manifest for artifact in inputs.artifacts.values()]
+        seconds = sum(float(manifest["seconds"]) for manifest in manifests) - overlap_s(manifests)
         facts = replace(facts, seconds=seconds, figures=_figures(inputs))
     except (
         SplatpipeError,

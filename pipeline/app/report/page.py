@@ -16,6 +16,7 @@ from splatpipe.pipeline.app.report.chapters.processing import files_chapter, mes
 from splatpipe.pipeline.app.report.chapters.surfaces import surfaces_chapter
 from splatpipe.pipeline.app.report.chapters.training import training_chapter, views_chapter
 from splatpipe.pipeline.app.report.facts.last_report import Chapter, LastReport
+from splatpipe.pipeline.app.report.facts.overlap import overlap_s
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs, results_digest
 from splatpipe.pipeline.app.report.facts.wording import count, duration, judged_of, judged_size, length, moment, number
 from splatpipe.pipeline.app.report.verdict import judge
@@ -172,7 +173,8 @@ def _cards(inputs: ReportInputs) -> list[tuple[str, str, str]]:
         cards.append(("PSNR", f"{number(evaluate.get('psnr'), 1)} dB", text + at + inside))
     if train:
         cards.append(("Gaussians", count(inputs.summary("clean").get("gaussians", train.get("gaussians"))), ""))
-    seconds = [float(artifact.manifest["seconds"]) for artifact in inputs.artifacts.values()]
-    if seconds:
-        cards.append(("Computing time", duration(sum(seconds)), "elapsed time of all stages"))
+    manifests = [artifact.manifest for artifact in inputs.artifacts.values()]
+    if manifests:
+        seconds = sum(float(manifest["seconds"]) for manifest in manifests) - overlap_s(manifests)
+        cards.append(("Computing time", duration(seconds), "elapsed time of all stages"))
     return cards

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatpipe.pipeline.app.node.assets.clouds import CloudFacts
+from splatpipe.pipeline.app.report.facts.overlap import overlap_s
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 
 DATE = "%d/%m/%Y at %H:%M:%S"  # as in OpenSfM's statistics
@@ -35,12 +36,13 @@ def run_statistics(
     tables = accuracy.get("tables") or {}
     gsd_m = accuracy.get("gsd_m")
     seconds = {name: stage.seconds for name, stage in inputs.history.stages.items() if stage.seconds is not None}
+    overlap = overlap_s(artifact.manifest for artifact in inputs.artifacts.values())
     moments = sorted(str(photo["time"]) for photo in photos if photo.get("time"))
     sparse = inputs.summary("sparse")
     points = [point for point in control.get("points", ()) if point.get("residual_m")]
     return {
         "odm_processing_statistics": {
-            "total_time": round(sum(seconds.values()), 1),
+            "total_time": round(sum(seconds.values()) - overlap, 1),
             **({} if gsd_m is None else {"average_gsd": round(100.0 * gsd_m, DIGITS)}),
         },
         "processing_statistics": {

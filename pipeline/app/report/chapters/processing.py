@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
+from splatpipe.pipeline.app.report.facts.overlap import overlap_s
 from splatpipe.pipeline.app.report.facts.report_inputs import ReportInputs
 from splatpipe.pipeline.app.report.facts.wording import count, duration, moment, plural, size
 from splatpipe.pipeline.engine.stage import shards_first, stage_name
@@ -59,9 +60,10 @@ def processing_chapter(inputs: ReportInputs, *, drawn: bool) -> Chapter:
         machine = machine or dict(artifact.manifest.get("machine", {}))
     options = {} if inputs.config is None else inputs.config.model_dump(mode="json")
     top_level_rows = [row for row in rows if not _is_in_stage(inputs, row["name"])]
+    overlap = overlap_s(artifact.manifest for artifact in inputs.artifacts.values())
     chapter: Chapter = {
         "rows": rows,
-        "total": duration(sum(row["seconds"] or 0.0 for row in top_level_rows)),
+        "total": duration(sum(row["seconds"] or 0.0 for row in top_level_rows) - overlap),
         "cpu_total": duration(sum(row["cpu_seconds"] or 0.0 for row in top_level_rows)),
         "peak": size(max((row["memory"] or 0 for row in rows), default=0) or None),
         "forecast": _forecast([row["foreseen"] for row in rows if row["foreseen"]]),
@@ -137,7 +139,7 @@ def _stage_row(inputs: ReportInputs, name: str) -> dict[str, Any]:
         "made": moment(manifest["finished_s"]) if manifest else "",
         "reason": "" if history is None else history.reason,
         "seconds": seconds,
-        "took": duration(seconds),
+        "took": duration(seconds) + (" beside others" if manifest.get("ahead") else ""),
         "cpu_seconds": manifest.get("cpu_seconds"),
         "cpu": duration(manifest.get("cpu_seconds")),
         "memory": memory,
