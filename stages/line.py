@@ -369,9 +369,9 @@ LINE = (
     CLEAN,
     EVALUATE,
     EXPORT,
+    SPLAT_DEPTHS,
     FLYTHROUGH,
     DEPTHS,
-    SPLAT_DEPTHS,
     DSM,
     DTM,
     ORTHO,
@@ -380,3 +380,11 @@ LINE = (
     MESH,
     PUBLISH,
 )
+
+AHEAD = {
+    "depths": "train",  # not earlier: features, matches and blocks go by the memory that is free
+    **dict.fromkeys(("dsm", "dtm", "ortho", "facades", "cloud", "mesh", "publish"), "flythrough"),
+}
+"""Stages that may run ahead of their turn, each with the first stage beside which it may.
+
+They use no graphics card, and their results do not depend on the summaries of the stages that they overtake."""

@@ -25,7 +25,7 @@ from variants import NAME, Variant, base_of, choose, config_of, split
 
 from splatpipe.pipeline.engine.digests import HashTable, digest
 from splatpipe.pipeline.engine.errors import SplatpipeError, UsageError
-from splatpipe.pipeline.engine.runs.runner import versions
+from splatpipe.pipeline.engine.runs.job_runner import versions
 from splatpipe.pipeline.engine.runs.source import open_source
 from splatpipe.pipeline.raster.isa import isa_name
 from splatpipe.stages.line import LINE

@@ -9,8 +9,8 @@ import shutil
 from pathlib import Path
 
 from splatpipe.pipeline.engine.machine import available_cores, available_memory_bytes, free_memory_bytes, mount_of
+from splatpipe.pipeline.engine.runs.job_runner import versions
 from splatpipe.pipeline.engine.runs.lock import is_locked, running_shards
-from splatpipe.pipeline.engine.runs.runner import versions
 from splatpipe.pipeline.engine.stage import JSON
 
 SHARED_MEMORY = Path("/dev/shm")

@@ -12,6 +12,7 @@ from pathlib import Path
 from splatpipe.pipeline.engine.config import resolve
 from splatpipe.pipeline.engine.events import Event
 from splatpipe.pipeline.engine.runs.executor import Executor
+from splatpipe.pipeline.engine.runs.job_runner import JobRunner
 from splatpipe.pipeline.engine.runs.line import Line
 from splatpipe.pipeline.engine.runs.lock import locked, locked_shard
 from splatpipe.pipeline.engine.runs.runner import Outcome, Runner
@@ -55,7 +56,7 @@ def make(
     with hold as held:
         executor = Executor(out / "log", tuple(held.descriptors), {"OMP_NUM_THREADS": str(threads)})
         machine = Machine("cpu", threads)
-        runner = Runner(line, store, executor, machine, show, dict, lambda config: None)
+        runner = Runner(JobRunner(line, store, executor, machine, show, dict), lambda config: None)
         try:
             return runner.run_shard("train", int(shard.split(".")[1])) if shard else runner.walk(until=until)
         finally:

@@ -79,7 +79,8 @@ def _run(stage: Stage, runner: Runner, parts: dict[str, Part], artifacts: Mappin
         inputs, stage.parts
     )
     try:
-        done = replace(runner, line=line, outcome=Outcome(dict(artifacts))).walk().artifacts[stage.name]
+        alone = replace(runner, jobs=replace(runner.jobs, line=line), outcome=Outcome(dict(artifacts)))
+        done = alone.walk().artifacts[stage.name]
     except SplatpipeError as error:
         return {"reused": reused, "failed": error.message, "files": {}}
     for name, part in done.parts.items():

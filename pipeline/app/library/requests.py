@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from splatpipe.stages.options import LineConfig
 
 SPENT_VARIABLE = "SPLATPIPE_SPENT_S"
+IN_TURN_VARIABLE = "SPLATPIPE_IN_TURN"  # set where the machine is shared by plan: a run then has one stage's resources
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
     from splatpipe.pipeline.engine.runs.source import with_absolute_files
     from splatpipe.pipeline.engine.stage import Machine
     from splatpipe.stages.forecast.needs import Forecaster
-    from splatpipe.stages.line import LINE
+    from splatpipe.stages.line import AHEAD, LINE
 
     began_s = round(time.monotonic() - spent_s(), 3)
     check_machine(device, threads)
@@ -72,7 +73,10 @@ def request_of(photos: Path, out: Path, config: LineConfig, device: str = "auto"
         import splatpipe.pipeline.raster.isa  # noqa: F401
     machine = Machine(device, threads or available_cores(), began_s, memory_limit(config, device))
     forecast_needs = Forecaster(config, machine.threads)
-    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, forecast_needs)
+    # Within a time budget, what ran beside training would decide how far it comes.
+    in_turn = config.train.time_budget_s or IN_TURN_VARIABLE in os.environ
+    ahead = {} if in_turn else AHEAD
+    return Request(LINE, with_absolute_files(config, LINE), photos, out, machine, forecast_needs, ahead)
 
 
 def check_machine(device: str, threads: int) -> None:

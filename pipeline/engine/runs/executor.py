@@ -7,7 +7,8 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO
@@ -23,6 +24,10 @@ from splatpipe.pipeline.engine.stage import JSON
 GRACE_S = 3.0  # training writes its checkpoint in less; Ctrl-C promises an end within five seconds
 
 
+class KilledError(StageError):
+    """The worker was killed: for want of memory, or by hand."""
+
+
 class Executor:
     """A worker process, started for the first task and kept for later ones.
 
@@ -30,13 +35,24 @@ class Executor:
         log: File for what libraries print.
         locks: Descriptors of the locks of the OUT and of a shard, inherited so that they last as long as the worker.
         environment: Additional environment variables for the worker (threads of the numeric libraries).
+        niceness: How far it stands back behind other processes (``os.nice``); 0: not at all.
     """
 
-    def __init__(self, log: Path, locks: tuple[int, ...], environment: Mapping[str, str]) -> None:
+    def __init__(self, log: Path, locks: tuple[int, ...], environment: Mapping[str, str], niceness: int = 0) -> None:
         self._log = log
         self._locks = locks
         self._environment = {**os.environ, **environment}
+        self._niceness = niceness
         self._process: subprocess.Popen[str] | None = None
+        self._asked_s: float | None = None  # when it was asked to end
+
+    def start(self) -> None:
+        """Start the worker, if there is none yet. To the kernel, the thread that does is its parent: it dies with it.
+
+        Raises:
+            MachineError: if no process can be started.
+        """
+        self._running_worker()
 
     def run(self, task: Task, sink: Sink) -> dict[str, JSON]:
         """Run one task to completion.
@@ -70,7 +86,8 @@ class Executor:
         code = process.wait()
         self._process = None
         _close(process)
-        raise StageError(
+        kind = KilledError if code == -signal.SIGKILL else StageError
+        raise kind(
             f"The stage {task.stage} {_cause(code)}.",
             hint=f"{_remedy(code)} See the end of the log: {self._log}",
         )
@@ -79,20 +96,37 @@ class Executor:
         """Peak resident memory of the worker in its current stage, bytes; None if it is dead or this is unknown."""
         return None if self._process is None else peak_memory_of(self._process.pid)
 
+    def resident_bytes(self) -> int:
+        """Resident memory of the worker now, bytes; 0 if there is none or this is unknown."""
+        process = self._process
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            if process is not None:
+                pages = Path(f"/proc/{process.pid}/statm").read_text(encoding="ascii").split()[1]
+                return int(pages) * os.sysconf("SC_PAGE_SIZE")
+        return 0
+
+    def ask_to_end(self) -> None:
+        """Ask the worker to terminate, once: a second time would interrupt the writing of its checkpoint."""
+        process = self._process
+        if process is not None and self._asked_s is None:
+            self._asked_s = time.monotonic()
+            process.terminate()
+
     def stop(self) -> None:
-        """End the worker: ask it to terminate, and kill it after ``GRACE_S``."""
-        process, self._process = self._process, None
+        """End the worker: ask it to terminate, and kill it ``GRACE_S`` after it was asked."""
+        process = self._process
         if process is None:
             return
         try:
-            process.terminate()
-            process.wait(GRACE_S)
+            self.ask_to_end()
+            process.wait(max(0.0, (self._asked_s or 0.0) + GRACE_S - time.monotonic()))
         except BaseException as error:
             process.kill()
             process.wait()
             if not isinstance(error, subprocess.TimeoutExpired):
                 raise
         finally:
+            self._process = None
             _close(process)
 
     def close(self) -> None:
@@ -114,13 +148,17 @@ class Executor:
     def _running_worker(self) -> subprocess.Popen[str]:
         if self._process is None:
             with appended_file(self._log) as log:
-                self._process = self._spawn(log)
+                self._process, self._asked_s = self._spawn(log), None
         return self._process
 
     def _spawn(self, log: IO[bytes]) -> subprocess.Popen[str]:
         try:
             return subprocess.Popen(
-                python_module("splatpipe.pipeline.engine.runs.worker", str(os.getpid())),
+                python_module(
+                    "splatpipe.pipeline.engine.runs.worker",
+                    str(os.getpid()),
+                    *([str(self._niceness)] if self._niceness else []),
+                ),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -139,6 +177,25 @@ class Executor:
         if failure["type"] == "KeyboardInterrupt":
             raise StopSignal(EXIT_TERMINATED)  # somebody terminated only the worker
         raise ERRORS[failure["type"]](failure["message"], failure["hint"])
+
+
+def stop_all(executors: Iterable[Executor]) -> None:
+    """End several workers within the time of one."""
+    each = list(executors)
+    try:
+        for executor in each:
+            executor.ask_to_end()
+    finally:
+        _stop_each(each)
+
+
+def _stop_each(executors: list[Executor]) -> None:
+    """Stop one after the other, the later ones even if an earlier one is interrupted."""
+    if executors:
+        try:
+            executors[0].stop()
+        finally:
+            _stop_each(executors[1:])
 
 
 def _close(process: subprocess.Popen[str]) -> None:

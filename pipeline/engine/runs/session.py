@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,9 @@ from splatpipe.pipeline.engine.digests import HashTable
 from splatpipe.pipeline.engine.events import Event, EventLog, EventReporter, Sink
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.python_module import SAFE_PATH
-from splatpipe.pipeline.engine.runs.executor import Executor
+from splatpipe.pipeline.engine.runs.ahead import NICENESS, Ahead
+from splatpipe.pipeline.engine.runs.executor import GRACE_S, Executor, stop_all
+from splatpipe.pipeline.engine.runs.job_runner import JobRunner
 from splatpipe.pipeline.engine.runs.line import Line
 from splatpipe.pipeline.engine.runs.lock import locked, locked_shard
 from splatpipe.pipeline.engine.runs.needs import ForecastFunction, no_forecasts
@@ -39,6 +42,8 @@ class Request:
         out: Where the results go.
         machine: Device and threads.
         forecast_needs: Forecasts each stage's resource use, for the manifests.
+        ahead: Names of the stages that may run ahead of their turn on idle cores, each with that of the first stage
+            beside which it may; empty: each in its turn.
     """
 
     stages: Sequence[Stage]
@@ -47,6 +52,27 @@ class Request:
     out: Path
     machine: Machine
     forecast_needs: ForecastFunction = no_forecasts
+    ahead: Mapping[str, str] = field(default_factory=dict)
+
+
+class _Outlet:
+    """Passes events on, those of several threads one after the other.
+
+    Args:
+        show: Shows events to the user.
+        log: Logs them.
+        confirm: Makes sure that OUT is still ours.
+    """
+
+    def __init__(self, show: Sink, log: Sink, confirm: Callable[[], None]) -> None:
+        self._show, self._log, self._confirm = show, log, confirm
+        self._lock = threading.RLock()
+
+    def __call__(self, event: Event) -> None:
+        with self._lock:
+            self._show(event)  # first: a full disk stops the log but not the display
+            self._log(event)
+            self._confirm()
 
 
 @contextmanager
@@ -78,25 +104,28 @@ def open_session(request: Request, show: Sink, *, wait: bool = False, shard: str
         lock = locked_shard(store.out, shard, wait=wait, notify=notify)
         events, log_file = shard_events(store.out, shard), store.shards / f"{shard}.log"
     with lock as hold:
-        log = _open_log(store, events)
-        executor = Executor(log_file, tuple(hold.descriptors), _worker_environment(request.machine.threads))
+        log, descriptors = _open_log(store, events), tuple(hold.descriptors)
+        environment = _worker_environment(request.machine.threads)
+        executor = Executor(log_file, descriptors, environment)
+        second = Executor(log_file, descriptors, environment, NICENESS)
+        ahead: Ahead | None = None
         try:
-
-            def sink(event: Event) -> None:
-                show(event)  # first: a full disk stops the log but not the display
-                log(event)
-                hold.confirm()
-
+            sink = _Outlet(show, log, hold.confirm)
             digests = partial(_digests, request, store, EventReporter("source", sink), remember=not shard)
             line = _open_line(request, digests())
-            save = partial(_save_config, store, source.folder)
-            yield Runner(line, store, executor, request.machine, sink, digests, save, request.forecast_needs)
+            jobs = JobRunner(line, store, executor, request.machine, sink, digests, request.forecast_needs)
+            if request.ahead and request.machine.threads > 1:  # else there is no idle core
+                ahead = Ahead(jobs, second, request.ahead)
+            yield Runner(jobs, partial(_save_config, store, source.folder), ahead)
         except BaseException:
-            executor.stop()
+            stop_all((executor, second))
             raise
         else:
             executor.close()
+            second.close()
         finally:
+            if ahead is not None:
+                ahead.join(GRACE_S)
             log.close()
 
 

@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from stat import S_ISREG
@@ -91,6 +91,10 @@ class StageInputs:
         return digest(asdict(self))
 
 
+def unchecked() -> None:
+    """The check of a commit that nothing keeps from being made."""
+
+
 class Store:
     """The ``stages/`` folder of an OUT.
 
@@ -131,7 +135,13 @@ class Store:
         return folder
 
     def commit(
-        self, stage: Stage, inputs: StageInputs, partial: Path, summary: Summary, run: Mapping[str, JSON]
+        self,
+        stage: Stage,
+        inputs: StageInputs,
+        partial: Path,
+        summary: Summary,
+        run: Mapping[str, JSON],
+        check: Callable[[], None] = unchecked,
     ) -> Artifact:
         """Turn ``partial`` into the stage's artifact: manifest last, everything synced, then one rename.
 
@@ -141,6 +151,8 @@ class Store:
             partial: Its working folder; files that belong to no part are deleted.
             summary: What the body returned.
             run: Versions, machine, timings: what is not part of the key.
+            check: Called after each of the steps that may take long, the last time just before the rename; what it
+                raises leaves ``partial`` as it is.
 
         Raises:
             StageError: if the body did not write one of its parts.
@@ -153,6 +165,7 @@ class Store:
                     hint="This is a bug in splatpipe; please report it.",
                 )
             entries = tree_entries(partial / relative, partial)
+            check()
             parts[name] = {
                 "path": relative,
                 "digest": part_digest(entries, relative),
@@ -169,8 +182,10 @@ class Store:
             **run,
         }
         sync_tree(partial)
+        check()
         write_durably(partial / MANIFEST, json.dumps(manifest, indent=1))
         _drop_strays(partial, {MANIFEST, *(entry["path"] for part in parts.values() for entry in part["files"])})
+        check()
         return self._publish(partial)
 
     def _publish(self, partial: Path) -> Artifact:

@@ -7,6 +7,7 @@ dies with its parent, whatever kills the parent.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -46,6 +47,7 @@ NO_MEMORY = (
     "cuda error: out of memory",
 )  # in libraries' errors
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE}
+OOM_SCORE = "500"  # of 1000: of two workers, the kernel kills the one that stands back if memory runs out
 BAD_DISK = {errno.EIO, errno.ESTALE, errno.ENXIO, errno.ENODEV}  # a failing disk, or a network share that went away
 
 
@@ -232,9 +234,21 @@ def _install_handlers() -> None:
     signal.signal(signal.SIGTERM, _interrupt)
 
 
+def _stand_back(niceness: int) -> None:
+    """Let other processes go first: on the processors, and in staying alive if memory runs out."""
+    os.nice(niceness)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(OOM_SCORE, encoding="ascii")
+
+
 def main() -> None:
-    """Serve the parent, whose process ID is on the command line, until it sends an exit request."""
+    """Serve the parent until it sends an exit request.
+
+    The parent's process ID is on the command line, then, for a worker that stands back, how far.
+    """
     die_with_parent(int(sys.argv[1]))
+    if len(sys.argv) > 2:
+        _stand_back(int(sys.argv[2]))
     _install_handlers()
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

@@ -31,7 +31,7 @@ from splatpipe.pipeline.app.batch.jobs.attempts import (
 from splatpipe.pipeline.app.batch.jobs.plan import BatchPlan, Call, PlannedCapture, StageJob, workflow_jobs
 from splatpipe.pipeline.app.batch.jobs.shards import counts_shards, store_shard_jobs
 from splatpipe.pipeline.app.library.commands import PART_VARIABLE
-from splatpipe.pipeline.app.library.requests import SPENT_VARIABLE
+from splatpipe.pipeline.app.library.requests import IN_TURN_VARIABLE, SPENT_VARIABLE
 from splatpipe.pipeline.app.report.facts.run_history import read_history
 from splatpipe.pipeline.engine.errors import EXIT_MACHINE, EXIT_STAGE, EXIT_TERMINATED
 from splatpipe.pipeline.engine.files.output_file import appended_file, write_file
@@ -163,7 +163,12 @@ def _run(
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=log_file,
-            env={**os.environ, SPENT_VARIABLE: f"{spent:.3f}", **({} if last else {PART_VARIABLE: "1"})},
+            env={
+                **os.environ,
+                IN_TURN_VARIABLE: "1",
+                SPENT_VARIABLE: f"{spent:.3f}",
+                **({} if last else {PART_VARIABLE: "1"}),
+            },
             start_new_session=True,
             preexec_fn=end_with_parent,  # noqa: PLW1509 (one thread)
         )

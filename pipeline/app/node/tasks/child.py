@@ -6,9 +6,10 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 
 from splatpipe.pipeline.app.node.tasks.under_parent import MODULE
 from splatpipe.pipeline.engine.files.output_file import appended_file
@@ -30,9 +31,17 @@ class Child:
         arguments: Its arguments.
         log: File that receives what it prints to stderr; what it prints to stdout if there is no ``answer``.
         answer: File that receives what it prints to stdout.
+        environment: Further environment variables.
     """
 
-    def __init__(self, module: str, arguments: Sequence[str], log: Path, answer: Path | None = None) -> None:
+    def __init__(
+        self,
+        module: str,
+        arguments: Sequence[str],
+        log: Path,
+        answer: Path | None = None,
+        environment: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         command = python_module(MODULE, str(os.getpid()), module, *arguments)
         if answer is not None:
             answer.unlink(missing_ok=True)
@@ -42,7 +51,7 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=errors,
-                env={**os.environ, **ENVIRONMENT},
+                env={**os.environ, **ENVIRONMENT, **environment},
                 start_new_session=True,
             )
         self.began_s = time.monotonic()

@@ -6,12 +6,14 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
+from splatpipe.pipeline.app.library.requests import IN_TURN_VARIABLE
 from splatpipe.pipeline.app.node.tasks.child import Child
 from splatpipe.pipeline.app.node.tasks.forecast import MODULE as FORECAST_MODULE
 from splatpipe.pipeline.app.node.tasks.jobs import Job, JobStore, link_files, seed_artifacts
 from splatpipe.pipeline.app.node.tasks.names import control_file, kind_of
 from splatpipe.pipeline.app.node.tasks.progress import RunProgress
 from splatpipe.pipeline.app.node.tasks.run_options import RunOptions, run_options
+from splatpipe.pipeline.app.node.tasks.settings import Settings
 from splatpipe.pipeline.engine.config import dump
 from splatpipe.pipeline.engine.files.durable import write_durably
 from splatpipe.pipeline.engine.files.json_file import read_json
@@ -109,8 +111,10 @@ def read_forecast(job: Job, jobs: JobStore) -> dict[str, Any]:
     return found
 
 
-def start_run(job: Job, jobs: JobStore, threads: int) -> JobProcess:
+def start_run(job: Job, jobs: JobStore, settings: Settings) -> JobProcess:
     """Start the run of a job; an earlier one is continued.
+
+    Where several run at once, each keeps to the memory of its forecast, which is that of one stage.
 
     Raises:
         OSError: if no process can be started.
@@ -118,11 +122,13 @@ def start_run(job: Job, jobs: JobStore, threads: int) -> JobProcess:
     given = run_options(job.options)
     out = jobs.out(job.key)
     arguments = ["run", str(photos_argument(job, jobs)), str(out), "--preset", given.preset]
-    arguments += ["--config", str(jobs.path(job.key) / OPTIONS_FILE), "--threads", str(threads), "--wait"]
+    arguments += ["--config", str(jobs.path(job.key) / OPTIONS_FILE), "--threads", str(settings.threads), "--wait"]
     arguments += ["--until", given.until] if given.until else []
     arguments += ["--time-budget", given.time_budget] if given.time_budget else []
     progress = RunProgress(out / EVENTS_FILE, job.forecast.weights)
-    return JobProcess(job, "run", Child(RUN_MODULE, arguments, jobs.output(job.key)), progress)
+    environment = {IN_TURN_VARIABLE: "1"} if settings.parallel > 1 else {}
+    child = Child(RUN_MODULE, arguments, jobs.output(job.key), environment=environment)
+    return JobProcess(job, "run", child, progress)
 
 
 def start_pack(job: Job, jobs: JobStore) -> JobProcess:

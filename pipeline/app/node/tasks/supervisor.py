@@ -208,7 +208,7 @@ class Supervisor:
             if job is None:
                 return
             job = self.jobs.change(job.key, state="running", began_ms=job.began_ms or now_ms(), waiting="")
-            self._begin(job, lambda each: start_run(each, self.jobs, self.settings.threads))
+            self._begin(job, lambda each: start_run(each, self.jobs, self.settings))
             if job.key not in self.processes:
                 self.jobs.change(job.key, state="queued")
                 return
