@@ -30,8 +30,8 @@ from rasterizing import contributing_pairs, raster_alone
 from tables import Row, console, print_table
 
 from splatpipe.pipeline.engine.heap import keep_freed_heap
-from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.runs.job_runner import versions
+from splatpipe.pipeline.engine.runs.peak_memory import peak_memory_bytes
 from splatpipe.pipeline.engine.stage import Inputs
 from splatpipe.pipeline.geometry.camera import Camera
 from splatpipe.pipeline.mvs.options import InitializeConfig
