@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -17,7 +16,6 @@ from rich.progress import (
     ProgressColumn,
     SpinnerColumn,
     Task,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -27,6 +25,7 @@ from rich.text import Text
 
 from splatpipe.pipeline.app.report.facts.wording import duration
 from splatpipe.pipeline.app.report.verdict import CAMERAS, Verdict
+from splatpipe.pipeline.app.terminal.running_stage import RunningStage, ShardTimes, Step
 from splatpipe.pipeline.app.terminal.sentences import sentence
 from splatpipe.pipeline.engine.errors import SplatpipeError
 from splatpipe.pipeline.engine.events import Event
@@ -63,46 +62,6 @@ def _count(value: float) -> str:
     return f"{value:,.0f}"
 
 
-@dataclass(frozen=True)
-class Step:
-    """A step of a stage, whose progress is counted by itself.
-
-    Attributes:
-        what: What is being done.
-        began_s: When it was first reported, ``time.monotonic()``.
-        done: How much of it was done then: a resumed training begins in the middle.
-    """
-
-    what: str = ""
-    began_s: float = 0.0
-    done: float = 0.0
-
-    def left_s(self, now_s: float, done: float, total: float) -> float | None:
-        """Seconds left at the rate until now; None if nothing was done since it began, or nothing is left."""
-        if not self.done < done < total:
-            return None
-        return (now_s - self.began_s) * (total - done) / (done - self.done)
-
-
-@dataclass
-class Display:
-    """What is shown of a stage that runs; another may run beside it.
-
-    Attributes:
-        began_s: When it started, ``time.monotonic()``.
-        printed_s: When its progress was last printed as a line.
-        step: The step it is in.
-        done: How much of that is done.
-        task: Its bar on a terminal.
-    """
-
-    began_s: float
-    printed_s: float = 0.0
-    step: Step = Step()
-    done: float = 0.0
-    task: TaskID | None = None
-
-
 class RunConsole:
     """Shows a run's events on stderr; a sink for the runner."""
 
@@ -110,7 +69,7 @@ class RunConsole:
         self._console = Console(file=sys.stderr, highlight=False, emoji=False)
         self._order: list[str] = []
         self._live: Progress | None = None
-        self._displays: dict[str, Display] = {}
+        self._running: dict[str, RunningStage] = {}
         self._shards = ShardTimes()
 
     def __call__(self, event: Event) -> None:
@@ -120,7 +79,7 @@ class RunConsole:
 
     def close(self) -> None:
         """Remove the bars, so that further output starts on its own line."""
-        self._displays.clear()
+        self._running.clear()
         if self._live is not None:
             self._live.stop()
             self._live = None
@@ -131,14 +90,14 @@ class RunConsole:
 
     def _stage_started(self, stage: str, data: Mapping[str, JSON]) -> None:
         now_s = time.monotonic()
-        display = self._displays[stage] = Display(now_s, now_s)
+        shown = self._running[stage] = RunningStage(now_s, now_s)
         self._shards.begin(stage, None if stage in self._order else data.get("shard"))  # None: the shard is run alone
         if not self._console.is_terminal:
             self._console.print(f"{self._label(stage)} started ({data['reason']})", markup=False)
             return
         if self._live is None:
             self._live = self._bars()
-        display.task = self._live.add_task(escape(f"{self._label(stage)} ({data['reason']})"), total=None, unit="")
+        shown.task = self._live.add_task(escape(f"{self._label(stage)} ({data['reason']})"), total=None, unit="")
 
     def _bars(self) -> Progress:
         bars = Progress(
@@ -159,20 +118,20 @@ class RunConsole:
     def _progress(self, stage: str, data: Mapping[str, JSON]) -> None:
         done, total, what, unit = data["done"], data["total"], str(data["what"]), str(data["unit"])
         now_s = time.monotonic()
-        display = self._displays.setdefault(stage, Display(now_s))
-        begins = what != display.step.what or done < display.done
-        display.done = done
+        shown = self._running.setdefault(stage, RunningStage(now_s))
+        begins = what != shown.step.what or done < shown.done
+        shown.done = done
         if begins:
-            display.step = Step(what, now_s, done)
-        of_all = self._shards.left(stage, now_s - display.began_s, done, total) if unit == "iterations" else ""
-        if self._live is not None and display.task is not None:
+            shown.step = Step(what, now_s, done)
+        of_all = self._shards.left(stage, now_s - shown.began_s, done, total) if unit == "iterations" else ""
+        if self._live is not None and shown.task is not None:
             description = escape(f"{self._label(stage)} {what}{of_all}")
             if begins:
-                self._live.reset(display.task, total=total)
-            self._live.update(display.task, completed=done, total=total, description=description, unit=unit)
-        elif not self._console.is_terminal and now_s - display.printed_s > PLAIN_INTERVAL_S:
-            display.printed_s = now_s
-            left_s = display.step.left_s(now_s, done, total)
+                self._live.reset(shown.task, total=total)
+            self._live.update(shown.task, completed=done, total=total, description=description, unit=unit)
+        elif not self._console.is_terminal and now_s - shown.printed_s > PLAIN_INTERVAL_S:
+            shown.printed_s = now_s
+            left_s = shown.step.left_s(now_s, done, total)
             left = "" if left_s is None else f", about {duration(left_s)} left"
             self._console.print(
                 f"{self._label(stage)} {what}: {_count(done)}/{_count(total)} {unit}{left}{of_all}", markup=False
@@ -193,9 +152,9 @@ class RunConsole:
 
     def _ended(self, stage: str) -> None:
         """Remove a stage's bar; without any, the space for them."""
-        display = self._displays.pop(stage, None)
-        if self._live is not None and display is not None and display.task is not None:
-            self._live.remove_task(display.task)
+        shown = self._running.pop(stage, None)
+        if self._live is not None and shown is not None and shown.task is not None:
+            self._live.remove_task(shown.task)
             if not self._live.tasks:
                 self.close()
 
@@ -215,51 +174,6 @@ class RunConsole:
         if of not in self._order:
             return stage.ljust(10)
         return f"{self._order.index(of) + 1:>2}/{len(self._order)} {stage:<10}"
-
-
-class ShardTimes:
-    """Durations of a stage's shards, run one after the other, to estimate the time left for all of them."""
-
-    def __init__(self) -> None:
-        self._took: dict[str, dict[str, float]] = {}
-        self._after: dict[str, int] = {}  # shards that are left after the current one, by stage
-
-    def begin(self, stage: str, shard: Mapping[str, int] | None) -> None:
-        """Record the start of a stage or of one of its shards.
-
-        Args:
-            stage: Its name.
-            shard: Its number and count; None for the stage's own body.
-        """
-        of = stage_name(stage)
-        self._after[of] = 0
-        if shard is not None:
-            took = self._took.get(of, {})
-            later = (f"{of}.{number}" for number in range(shard["number"] + 1, shard["count"] + 1))
-            self._after[of] = sum(name not in took for name in later)
-
-    def end(self, stage: str, seconds: float) -> None:
-        """Record the end of a shard."""
-        if stage != stage_name(stage):
-            self._took.setdefault(stage_name(stage), {})[stage] = seconds
-
-    def left(self, stage: str, seconds: float, done: float, total: float) -> str:
-        """The approximate time left for all shards, in words; empty for the last one, and if unknown.
-
-        Args:
-            stage: Its stage, or the current shard.
-            seconds: Elapsed time of the current shard.
-            done: Its work done.
-            total: Its total work.
-        """
-        of = stage_name(stage)
-        after = self._after.get(of, 0)
-        if not after or not done or not total:
-            return ""
-        whole = seconds * total / done
-        each = [*self._took.get(of, {}).values(), whole]
-        left = whole - seconds + after * sum(each) / len(each)
-        return f", {duration(left)} including the {after} remaining"
 
 
 def escape(text: str) -> str:
