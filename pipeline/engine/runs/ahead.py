@@ -213,9 +213,12 @@ class Ahead:
         return None
 
     def _may(self, stage: Stage, beside: Stage) -> bool:
+        """Whether a stage may run beside that one; one that is turned off takes no time in its turn."""
         names = [each.name for each in self._own.line.stages]
         first = self._firsts.get(stage.name)
-        return first in names and stage.shards is None and names.index(first) <= names.index(beside.name)
+        if first not in names or stage.shards is not None or self._own.line.is_off(stage):
+            return False
+        return names.index(first) <= names.index(beside.name)
 
     def _fits(self, stage: Stage, beside: Stage, summaries: Mapping[str, Summary]) -> bool:
         """Whether two stages fit into the memory together, of the machine, the user's limit, and what is free now."""

@@ -63,10 +63,14 @@ class Line:
                 wanted |= {stage_name(part) for part in self.reads_of(stage) if part not in self.source}
         return [stage for stage in self.stages[: last + 1] if stage.name in wanted]
 
+    def is_off(self, stage: Stage) -> bool:
+        """Whether a stage is turned off."""
+        section: StageConfig = getattr(self.config, stage_name(stage.name))
+        return section.is_off
+
     def reads_of(self, stage: Stage) -> tuple[str, ...]:
         """The parts that a stage or one of its shards reads; none if the stage is turned off."""
-        section: StageConfig = getattr(self.config, stage_name(stage.name))
-        return () if section.is_off else stage.reads
+        return () if self.is_off(stage) else stage.reads
 
     def inputs_of(self, stage: Stage, parts: Mapping[str, Part]) -> StageInputs:
         """The inputs that make up a stage's key."""
