@@ -45,6 +45,21 @@ def test_kill_9_in_every_stage_loses_nothing(photos: Path, undisturbed: Path, tm
     assert sha256(out / "splat.ply") == sha256(undisturbed / "splat.ply")
 
 
+def test_kill_9_while_depths_are_found_beside_training_loses_nothing(
+    photos: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, KILLED_RUN, photos, out, "depths", "beside", *QUICK]
+    died = subprocess.run(command, check=False, start_new_session=True, capture_output=True)
+    assert died.returncode == -signal.SIGKILL, died.stderr.decode()[-2000:]
+    assert '"ahead": true' in (out / "events.jsonl").read_text()
+    assert not list((out / "stages").glob("depths-*"))
+    ran(answered("run", photos, out, *sets(*QUICK)))
+    mine, theirs = part_digests(out), part_digests(undisturbed)
+    timed = {"export.metrics"}  # seconds and bytes of this very run
+    assert {name for name in theirs if mine[name] != theirs[name]} <= timed
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_command_says_so_and_goes_on_later(
     photos: Path, copy_of_run: Path, number: signal.Signals, code: int
