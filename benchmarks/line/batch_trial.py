@@ -156,7 +156,7 @@ def changed(night: BatchTrial, captures: Mapping[str, Path]) -> None:
     new = [json.loads(line) for line in after["orbit"][len(before["orbit"]) :].splitlines()]
     started = [event["stage"] for event in new if event["kind"] == "stage_started"]
     check(
-        started == ["blocks", "train", "clean", "evaluate", "export", "flythrough", "splat_depths"],
+        started == ["blocks", "train", "clean", "evaluate", "export", "splat_depths", "flythrough"],
         f"of the changed one {', '.join(started)}",
     )
     states = {capture["name"]: capture["state"] for capture in result["captures"]}

@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatpipe.pipeline.app.library.requests import IN_TURN_VARIABLE
+
 POLL_S = 0.1  # far shorter than any run
 GRACE_S = 10.0  # the pipeline ends within five seconds of a signal
 HOME = Path(__file__).resolve().parents[1]
@@ -96,10 +98,16 @@ class _Running:
     def start(command: Command) -> _Running:
         command.log.parent.mkdir(parents=True, exist_ok=True)
         words = [sys.executable, *command.words]
+        environment = os.environ | {IN_TURN_VARIABLE: "1"}  # the time and memory of each stage are its own
         with command.log.open("wb") as log, _output_file(command).open("wb") as output:
             # In a session of its own: the terminal's Ctrl-C reaches only this process, which terminates the children.
             process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=output, stderr=log, start_new_session=True
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=log,
+                env=environment,
+                start_new_session=True,
             )
         return _Running(command, process, time.perf_counter())
 
