@@ -51,9 +51,9 @@ function duration(seconds) {
 const make = (tag, name, text) => Object.assign(document.createElement(tag), { className: name, textContent: text });
 
 function show() {
-  const [running, ...beside] = latest.stages.filter((stage) => stage.state === "running");
+  const running = latest.stages.find((stage) => stage.state === "running");
   const failed = latest.stages.find((stage) => stage.state === "failed");
-  showState(running, beside, failed);
+  showState(running, failed);
   $("stages").replaceChildren(
     ...latest.stages.map((stage) => {
       const item = make("li", stage.state, stage.name);
@@ -69,10 +69,10 @@ function show() {
   );
 }
 
-function showState(running, beside, failed) {
+function showState(running, failed) {
   const all = latest.stages.length > 0 && latest.stages.every((stage) => ["done", "reused"].includes(stage.state));
   const [kind, text] = latest.at_work
-    ? ["running", running ? [running, ...beside].map((stage) => stage.name).join(", ") : "beginning"]
+    ? ["running", running ? running.name : "beginning"]
     : failed
       ? ["failed", `${failed.name}: ${failed.message}`]
       : all
