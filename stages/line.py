@@ -53,7 +53,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=12,
+    version=13,
     config=SparseConfig,
     reads=(
         "matches.database",
