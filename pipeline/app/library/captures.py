@@ -98,8 +98,9 @@ def run_capture(
         device: ``auto``, ``cpu`` or ``cuda``.
         threads: Threads; 0 for all cores. Does not change the result.
         wait: If another splatpipe is working in OUT, wait for it instead of failing.
-        on_event: Called with each event: stages that start and end, progress, notes, warnings. If it raises an
-            exception, the run stops, and can be resumed.
+        on_event: Called with each event: stages that start and end, progress, notes, warnings; one call at a time, but
+            those of a stage that runs beside another come from a second thread. If it raises an exception, the run
+            stops, and can be resumed.
 
     Returns:
         The run.

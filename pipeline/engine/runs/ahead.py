@@ -152,7 +152,7 @@ class Ahead:
             return
         try:
             self._own.executor.start()
-        except MachineError:  # too many processes for two workers: one suffices
+        except (MachineError, OSError):  # e.g. a limit on processes: one worker suffices
             self._given_up = True
             return
         self._running = chosen

@@ -121,6 +121,8 @@ def open_session(request: Request, show: Sink, *, wait: bool = False, shard: str
             stop_all((executor, second))
             raise
         else:
+            if ahead is not None:
+                ahead.join(GRACE_S)
             executor.close()
             second.close()
         finally:
