@@ -102,6 +102,7 @@ SUM = Stage(
 SHOW = Stage("show", 1, ShowConfig, ("sum.total",), {"shown": "shown.txt"}, "sharded:show", deliverables=("shown",))
 
 LINE = (READ, DIVIDE, SUM, SHOW)
+AHEAD: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
