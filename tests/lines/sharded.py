@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 from arithmetic import READ, ReadConfig
 
@@ -42,6 +43,7 @@ class LineConfig(StageConfig):
     divide: DivideConfig = DivideConfig()
     sum: SumConfig = SumConfig()
     show: ShowConfig = ShowConfig()
+    train: ClassVar = SimpleNamespace(time_budget_s=0.0)  # no stage: the program asks every run for its budget
 
 
 def divide(config: DivideConfig, inputs: Inputs, out: Path, report: Reporter) -> Summary:
