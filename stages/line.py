@@ -53,7 +53,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=13,
+    version=14,
     config=SparseConfig,
     reads=(
         "matches.database",

@@ -75,6 +75,29 @@ def complete(
     model.update_point_3d_errors()
 
 
+def settle(
+    model: pycolmap.Reconstruction,
+    database: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    stop: pycolmap.CancellationToken,
+) -> None:
+    """Adjust a model roughly, in place, on one thread, and filter wrong observations.
+
+    Args:
+        model: Some of the database's photos, with cameras and points.
+        database: The database that the model was mapped from.
+        options: The mapper's options.
+        stop: Ends the adjustment early.
+    """
+    mapper = pycolmap.IncrementalMapper(read_correspondences(database))
+    mapper.begin_reconstruction(model)
+    mapper.complete_and_merge_tracks(options.get_triangulation())
+    _adjust(mapper, options, stop, rough=True)
+    mapper.filter_points(options.get_mapper())
+    mapper.filter_frames(options.get_mapper())
+    mapper.end_reconstruction(False)
+
+
 def read_correspondences(database: Path) -> pycolmap.DatabaseCache:
     """Read what COLMAP's mapper works on: photos, keypoints and verified matches. It does not change them."""
     options = pycolmap.DatabaseCacheOptions()

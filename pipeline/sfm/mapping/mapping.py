@@ -6,7 +6,7 @@ Both run in a thread of their own, so that the calling thread can report progres
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -15,7 +15,8 @@ import pycolmap
 
 from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.parallel import run_in_thread
-from splatpipe.pipeline.sfm.mapping.completion import Progress, complete
+from splatpipe.pipeline.sfm.mapping.completion import MIN_MATCHES, Progress, complete
+from splatpipe.pipeline.sfm.mapping.placing import GROWTH, Placement
 from splatpipe.pipeline.sfm.matching.reduction import best_keypoints, write_reduced
 from splatpipe.pipeline.sfm.model.view_graph import read_verified
 
@@ -23,7 +24,6 @@ Model: TypeAlias = pycolmap.Reconstruction
 
 BEST_KEYPOINTS = 400  # per photo; 700 placed no more photos in any capture, and took up to twice the time
 MAX_REDUCED_SHARE = 0.9  # share of the matches left by the reduction, above which it saves nothing
-GLOBAL_BA_GROWTH = 1.5  # growth of photos or points between global adjustments; COLMAP's 1.1 makes four times as many
 GLOBAL_BA_TOLERANCE = 1e-4  # relative change of the cost at which these adjustments end
 ONE_THREAD = 1  # with several, COLMAP's and Ceres' sums depend on which thread finishes first
 
@@ -62,47 +62,25 @@ def map_incremental(database: Path, scratch: Path, options: MappingOptions, on_p
     Returns:
         All sub-models, the largest first.
     """
-    total = _photos(database)
-    placed, begun = 0, 0
-    now = (0, total, "choosing keypoints", "photos")
+    now = (0, _photos(database), "choosing keypoints", "photos")
     stop = pycolmap.CancellationToken()
-
-    def begin() -> None:
-        nonlocal placed, begun
-        placed, begun = 1, begun + 1
-        place()
-
-    def place() -> None:
-        nonlocal placed
-        placed += 1
-        report_step(
-            min(placed, total), total, "placing photos" if begun < 2 else f"placing photos (model {begun})", "photos"
-        )
 
     def report_step(done: int, of: int, what: str, unit: str) -> None:
         nonlocal now
         now = (done, of, what, unit)
 
+    placement = Placement(incremental_options(options), stop, report_step)
+
     def work() -> list[Model]:
         pycolmap.set_random_seed(options.seed)  # thread-local
-        settings = incremental_options(options)
         with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
-            reduced = _reduced(database, Path(folder))
-            found: Mapping[int, Model] = pycolmap.incremental_mapping(
-                reduced,
-                folder,
-                folder,
-                settings,
-                initial_image_pair_callback=begin,
-                next_image_callback=place,
-                cancellation_token=stop,
-            )
-        for model in found.values():
-            complete(model, database, settings, stop, on_progress=report_step)
+            found = placement.run(*_reduced(database, Path(folder)), Path(folder))
+        for model in found:
+            complete(model, database, incremental_options(options), stop, on_progress=report_step)
         return_free_heap()  # of this thread, which no other would use
         return largest_first(found)
 
-    return run_in_thread(work, lambda: on_progress(*now), stop.cancel)
+    return run_in_thread(work, lambda: on_progress(*now), placement.cancel)
 
 
 def map_global(database: Path, scratch: Path, options: MappingOptions, on_progress: Progress) -> list[Model]:
@@ -124,16 +102,21 @@ def map_global(database: Path, scratch: Path, options: MappingOptions, on_progre
     def work() -> list[Model]:
         pycolmap.set_random_seed(options.seed)
         with tempfile.TemporaryDirectory(prefix="mapping-", dir=scratch, ignore_cleanup_errors=True) as folder:
-            return largest_first(pycolmap.global_mapping(database, folder, folder, global_options(options)))
+            return largest_first(pycolmap.global_mapping(database, folder, folder, global_options(options)).values())
 
     return run_in_thread(work, lambda: on_progress(0, total, "placing all photos at once", "photos"), lambda: None)
 
 
-def _reduced(database: Path, folder: Path) -> Path:
-    """Write a database of the best keypoints' matches; return the whole one if that drops hardly any matches."""
+def _reduced(database: Path, folder: Path) -> tuple[Path, int]:
+    """Write a database of the best keypoints' matches; return it, or the whole one if that drops hardly any matches.
+
+    Also returns the number of photos that COLMAP's mapper would place.
+    """
     target = folder / "best.db"
-    kept, total = write_reduced(database, target, best_keypoints(read_verified(database), BEST_KEYPOINTS))
-    return target if kept < MAX_REDUCED_SHARE * total else database
+    verified = read_verified(database)
+    connected = {photo for pair, rows in verified.matches.items() if len(rows) >= MIN_MATCHES for photo in pair}
+    kept, total = write_reduced(database, target, best_keypoints(verified, BEST_KEYPOINTS))
+    return target if kept < MAX_REDUCED_SHARE * total else database, len(connected)
 
 
 def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipelineOptions:
@@ -146,7 +129,7 @@ def incremental_options(options: MappingOptions) -> pycolmap.IncrementalPipeline
     result.triangulation.random_seed = options.seed
     result.num_threads = ONE_THREAD
     # The final adjustment runs to convergence; until then cameras need only be good enough to place the next photo.
-    result.ba_global_frames_ratio = result.ba_global_points_ratio = GLOBAL_BA_GROWTH
+    result.ba_global_frames_ratio = result.ba_global_points_ratio = GROWTH
     result.ba_global_max_refinements, result.ba_local_max_refinements = 2, 1
     result.ba_global_max_num_iterations = 20
     result.ba_global_function_tolerance = result.ba_local_function_tolerance = GLOBAL_BA_TOLERANCE
@@ -181,9 +164,9 @@ def global_options(options: MappingOptions) -> pycolmap.GlobalPipelineOptions:
     return result
 
 
-def largest_first(models: Mapping[int, Model]) -> list[Model]:
+def largest_first(models: Iterable[Model]) -> list[Model]:
     """Sort models by photos, then by points, largest first; COLMAP's first model may not be the largest."""
-    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def _photos(database: Path) -> int:

@@ -9,6 +9,7 @@ import pytest
 from flight_scene import FOCAL_PX, GSD_M, SyntheticFlight, make_flight, write_database
 from mapped_apart import centre_errors, centres, oracle
 
+from splatpipe.pipeline.sfm.mapping import completion, placing
 from splatpipe.pipeline.sfm.mapping.completion import complete
 from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_options, map_global, map_incremental
 from splatpipe.pipeline.sfm.matching.reduction import PAIR_FLOOR, best_keypoints, write_reduced
@@ -138,3 +139,44 @@ def test_the_adjustment_reports_photos_and_rounds(database: Path, mapped: list[p
     rounds = [report for report in reports if report[3] == "rounds"]
     assert [done for done, *_ in photos] == list(range(PHOTOS)) and {of for _, of, *_ in photos} == {PHOTOS}
     assert [done for done, *_ in rounds] == list(range(len(rounds))) and 2 <= len(rounds) <= rounds[0][1]
+
+
+def test_many_photos_are_placed_in_legs_with_an_adjustment_after_each(
+    database: Path, flight: SyntheticFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached: list[int] = []
+
+    def settle(model: pycolmap.Reconstruction, *rest: Any) -> None:
+        reached.append(model.num_reg_images())
+        completion.settle(model, *rest)
+
+    monkeypatch.setattr(placing, "MAX_FACTORIZED", 20)
+    monkeypatch.setattr(placing, "settle", settle)
+    (model,) = map_incremental(database, tmp_path, MappingOptions(), lambda *_: None)
+    assert reached == [20, 30, 45, PHOTOS] and model.num_reg_images() == PHOTOS
+    assert error_gsd(model, flight) < 2.0 * error_gsd(oracle(flight), flight)
+
+
+def test_a_second_model_is_found_after_a_leg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two flights that no match ties: the first is placed in two legs, then the second from its own first pair."""
+    flight = make_flight(24, 3, 500)
+    write_database(flight, tmp_path / "whole.db", 3)
+    verified = read_verified(tmp_path / "whole.db")
+    apart = {number: np.full(len(places), True) for number, places in verified.keypoints.items()}
+    write_reduced(tmp_path / "whole.db", tmp_path / "apart.db", apart)
+    with pycolmap.Database.open(tmp_path / "apart.db") as opened:
+        for first, second in verified.matches:
+            if (first <= 12) != (second <= 12):
+                opened.delete_two_view_geometry(first, second)
+    monkeypatch.setattr(placing, "MAX_FACTORIZED", 8)
+    models = map_incremental(tmp_path / "apart.db", tmp_path, MappingOptions(), lambda *_: None)
+    photos = [set(model.reg_image_ids()) for model in models]
+    assert sorted(map(sorted, photos)) == [list(range(1, 13)), list(range(13, 25))]
+
+
+def test_placing_that_is_cancelled_between_two_legs_ends(database: Path, tmp_path: Path) -> None:
+    stop = pycolmap.CancellationToken()
+    placement = placing.Placement(incremental_options(MappingOptions()), stop, lambda *_: placement.cancel())
+    with pytest.raises(InterruptedError):
+        placement.run(database, PHOTOS, tmp_path)
+    assert stop.is_cancelled
