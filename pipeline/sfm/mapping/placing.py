@@ -62,11 +62,14 @@ class Placement:
         """
         self._total, self._goal = total, min(total, MAX_FACTORIZED)
         found = self._map(database, folder, None)
+        before = 0
         while self._leg.is_cancelled and len(found) == 1:
             settle(found[0], database, self._settings, self._stop)
-            if self._placed >= total:
+            # The mapper may have dropped photos after they were counted, as an adjustment may: they are tried again.
+            self._placed = found[0].num_reg_images()
+            if self._placed >= total or self._placed <= before:
                 break
-            self._goal = min(total, int(GROWTH * self._placed))
+            before, self._goal = self._placed, min(total, int(GROWTH * self._placed))
             found = self._map(database, folder, found[0])
         return found
 

@@ -157,6 +157,24 @@ def test_many_photos_are_placed_in_legs_with_an_adjustment_after_each(
     assert error_gsd(model, flight) < 2.0 * error_gsd(oracle(flight), flight)
 
 
+@pytest.mark.parametrize(("times", "placed"), [(1, PHOTOS), (99, PHOTOS - 1)])
+def test_photos_that_were_dropped_are_tried_again_as_long_as_that_helps(
+    times: int, placed: int, database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = 0
+
+    def settle(model: pycolmap.Reconstruction, *_: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls <= times:
+            model.deregister_frame(model.image(max(model.reg_image_ids())).frame_id)
+
+    monkeypatch.setattr(placing, "settle", settle)
+    placement = placing.Placement(incremental_options(MappingOptions()), pycolmap.CancellationToken(), lambda *_: None)
+    (model,) = placement.run(database, PHOTOS, tmp_path)
+    assert model.num_reg_images() == placed and calls == 2
+
+
 def test_a_second_model_is_found_after_a_leg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two flights that no match ties: the first is placed in two legs, then the second from its own first pair."""
     flight = make_flight(24, 3, 500)
