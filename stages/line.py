@@ -53,7 +53,7 @@ MATCHES = Stage(
 )
 SPARSE = Stage(
     "sparse",
-    version=14,
+    version=15,
     config=SparseConfig,
     reads=(
         "matches.database",

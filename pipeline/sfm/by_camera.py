@@ -13,6 +13,7 @@ from splatpipe.pipeline.engine.stage import JSON, Reporter
 from splatpipe.pipeline.geometry.lens_projection import project_through_lens
 from splatpipe.pipeline.sfm.judging.judging import TRUSTED_SOURCES
 from splatpipe.pipeline.sfm.lenses.focal import adjust_within
+from splatpipe.pipeline.sfm.model.structure import read_observations
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 MAX_CAMERAS_REPORTED = 10  # cameras listed on the console; the report lists them all
@@ -83,7 +84,7 @@ def camera_rows(model: pycolmap.Reconstruction, verified: ViewGraph, cameras: Se
     """Return a row per camera in the model: name, photos, photos placed, focal lengths, reprojection error."""
     placed = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     photos = Counter(verified.camera_of.values())
-    errors = _errors_px(model)
+    errors = _errors_px(model, verified)
     rows = []
     for number, camera in sorted(model.cameras.items()):
         group = cameras[number - 1] if number <= len(cameras) else {}
@@ -114,21 +115,19 @@ def report_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None
         report.note(f"Camera {row['id']}, {row['name'] or 'unknown'}: {placed}, focal length {focal}{error}.")
 
 
-def _errors_px(model: pycolmap.Reconstruction) -> dict[int, float]:
+def _errors_px(model: pycolmap.Reconstruction, verified: ViewGraph) -> dict[int, float]:
     """Return the mean reprojection error of each camera's observations, pixels."""
     result = {}
-    points = model.points3D
-    numbers = np.array(sorted(points), np.int64)
-    all_places = np.array([points[number].xyz for number in numbers.tolist()], np.float64).reshape(-1, 3)
+    seen = read_observations(model)
     for number in sorted(model.cameras):
         camera, total, count = model.cameras[number], 0.0, 0
         for image in (model.images[i] for i in sorted(model.reg_image_ids())):
-            seen = image.get_observation_points2D() if image.camera_id == number else []
-            if seen:
+            mine = seen.of(image.image_id)
+            if image.camera_id == number and mine.start < mine.stop:
                 pose = np.asarray(image.cam_from_world().matrix(), np.float64)
-                rows = np.searchsorted(numbers, [point.point3D_id for point in seen])
-                projected, _ = project_through_lens(camera, pose, all_places[rows])
-                off = np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1)
+                projected, _ = project_through_lens(camera, pose, seen.points[seen.row[mine]])
+                places = verified.keypoints[image.image_id][seen.keypoint[mine]].astype(np.float64)
+                off = np.linalg.norm(projected - places, axis=1)
                 total, count = total + float(off[np.isfinite(off)].sum()), count + int(np.isfinite(off).sum())
         if count and math.isfinite(total):
             result[number] = round(total / count, 4)

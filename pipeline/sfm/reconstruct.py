@@ -134,7 +134,7 @@ class Reconstructor:
         if answer.models:
             model, *others = answer.models
             while loose := loosely_tied(model):
-                model = without(model, self.verified, loose)
+                model = without(model, loose)
             found = judge(model, self.verified, self.capture.cameras)
             answer = replace(answer, models=[model, *others], judgement=found)
         self.tried.append(answer)

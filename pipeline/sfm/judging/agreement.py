@@ -14,6 +14,7 @@ import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
+from splatpipe.pipeline.sfm.model.structure import observed_points
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 
 EXPLAINED_PX = 4.0  # distance from the epipolar line that verification itself allows; more in large photos
@@ -177,6 +178,6 @@ def _points(image: pycolmap.Image | None, count: int) -> Int64[np.ndarray, " n"]
     """Return the id of the point that each keypoint of a photo observes, -1 for none."""
     result = np.full(count, -1, np.int64)
     if image is not None:
-        seen = [point.point3D_id for point in image.get_observation_points2D()]
-        result[image.get_observation_point2D_idxs()] = seen
+        keypoints, ids = observed_points(image)
+        result[keypoints] = ids
     return result

@@ -13,6 +13,8 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
+from splatpipe.pipeline.geometry.meeting_rays import ray_equations
+
 MIN_VIEWS = 3  # two that intersect, and one that is predicted
 REWEIGHTINGS = 2  # rounds of weighting rays by the distance to the point from the previous round
 MIN_ANGLE = 0.02  # its square is the minimum eigenvalue ratio: nearly parallel rays do not determine a point
@@ -66,22 +68,18 @@ def predicted_errors(model: pycolmap.Reconstruction, tracks: TrackObservations) 
     Returns:
         Errors, pixels; infinite where the other observations do not determine a point.
     """
-    rotations, centres, rays = _rays(model, tracks)
+    rotations, centres, rays = world_rays(model, tracks)
     count = int(tracks.track[-1]) + 1 if len(tracks.track) else 0
     weights = np.ones(len(rays))
     predicted = np.zeros((len(rays), 3))
     for _ in range(REWEIGHTINGS):
-        blocks = weights[:, None, None] * (np.eye(3) - rays[:, :, None] * rays[:, None, :])
-        sides = np.einsum("nij,nj->ni", blocks, centres)
-        whole = np.zeros((count, 3, 3))
-        side = np.zeros((count, 3))
-        np.add.at(whole, tracks.track, blocks)
-        np.add.at(side, tracks.track, sides)
-        left = whole[tracks.track] - blocks
+        equations = ray_equations(tracks.track, count, centres, rays, weights)
+        left = equations.whole[tracks.track] - equations.across
         sound = np.isfinite(left).all(axis=(1, 2)) & (weights > 0.0)
         sound[sound] = _well_placed(left[sound])
         left[~sound] = np.eye(3)
-        predicted = np.linalg.solve(left, (side[tracks.track] - sides)[:, :, None])[:, :, 0]
+        sides = equations.side[tracks.track] - equations.pulled
+        predicted = np.linalg.solve(left, sides[:, :, None])[:, :, 0]
         distance = np.linalg.norm(predicted - centres, axis=1)
         weights = np.where(sound, 1.0 / np.maximum(distance, 1e-9) ** 2, 0.0)
     errors = np.full(len(rays), np.inf)
@@ -142,7 +140,7 @@ def rows_by_camera(
     return [(number, np.flatnonzero(cameras == number)) for number in np.unique(cameras).tolist()]
 
 
-def _rays(
+def world_rays(
     model: pycolmap.Reconstruction, tracks: TrackObservations
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Return for each observation the photo's rotation, its centre, and the unit ray in the model's frame."""

@@ -21,6 +21,7 @@ from jaxtyping import Float64
 
 from splatpipe.pipeline.engine.heap import return_free_heap
 from splatpipe.pipeline.engine.stage import JSON, Reporter
+from splatpipe.pipeline.sfm.lenses.carried_over import carry_over
 from splatpipe.pipeline.sfm.lenses.focal import UNOBSERVED, focal_sigmas
 from splatpipe.pipeline.sfm.lenses.held_out import of_photos, tracks_of
 from splatpipe.pipeline.sfm.lenses.lens_adjustment import BASE, LensFreedom, adjust_lenses, weak_prior
@@ -103,6 +104,7 @@ def _with_held(
             widen(lens)
             set_lens(camera, lens.model_name, named_params(lens))
             states[number] = replace(states[number], changed=True, stated=stated[number].source, freed=("stated",))
+    adjust_lenses(lensed, {number: state.freedom for number, state in states.items()})
     result = _finished(model, verified, lensed, states, seed)
     return result, _rows(model, result, states, stated)
 
@@ -132,21 +134,11 @@ def _finished(
     states: Mapping[int, LensState],
     seed: int,
 ) -> pycolmap.Reconstruction:
-    """Apply the calibrated lenses to the whole model: adjust, retriangulate, and adjust again."""
+    """Apply the calibrated lenses to the whole model: carry them over, retriangulate, and adjust."""
     return_free_heap()  # of the trials
-    result = pycolmap.Reconstruction(model)
-    for number, camera in result.cameras.items():
-        lens = lensed.cameras[number]
-        if is_known(lens.model_name):
-            set_lens(camera, lens.model_name, named_params(lens))
-    for number in sorted(result.reg_image_ids()):
-        image = result.images[number]
-        if lensed.exists_image(number):
-            image.frame.set_cam_from_world(image.camera_id, lensed.images[number].cam_from_world())
-    freedoms = {number: state.freedom for number, state in states.items()}
-    adjust_lenses(result, freedoms)
+    result = carry_over(model, lensed, verified)
     retriangulate(result, verified, seed)
-    adjust_lenses(result, freedoms)
+    adjust_lenses(result, {number: state.freedom for number, state in states.items()})
     pycolmap.ObservationManager(result).filter_all_points3D(MAX_ERROR_PX, 0.0)
     for camera in result.cameras.values():
         if is_known(camera.model_name):

@@ -1,4 +1,4 @@
-"""Convert a model's points and tracks to arrays, and arrays back to a model on a view graph's keypoints."""
+"""Convert a model's points and observations to arrays, and arrays back to a model on a view graph's keypoints."""
 
 from __future__ import annotations
 
@@ -27,37 +27,77 @@ class Structure:
     points: Float64[np.ndarray, "m 3"]
     tracks: Sequence[Track]
 
+
+@dataclass(frozen=True)
+class Observations:
+    """The points of a model and all observations of them, photo by photo.
+
+    Attributes:
+        photo: COLMAP's number of the photo of each observation, ascending.
+        keypoint: Its keypoint, ascending within a photo.
+        row: The row of its point.
+        ids: (m,) COLMAP's ids of the points, in the order of their first observations, which is that of their tracks.
+        points: (m, 3), model units.
+    """
+
+    photo: Int64[np.ndarray, " n"]
+    keypoint: Int64[np.ndarray, " n"]
+    row: Int64[np.ndarray, " n"]
+    ids: Int64[np.ndarray, " m"]
+    points: Float64[np.ndarray, "m 3"]
+
+    def of(self, photo: int) -> slice:
+        """Return the rows of a photo's observations."""
+        return slice(*np.searchsorted(self.photo, [photo, photo + 1]).tolist())
+
     def rows(self, counts: Mapping[int, int]) -> dict[int, Int64[np.ndarray, " _"]]:
         """Return, for every photo, the row of the point that each keypoint observes, or -1.
 
         Args:
             counts: Number of keypoints of each photo.
         """
-        found = {number: np.full(count, -1, np.int64) for number, count in counts.items()}
-        for row, track in enumerate(self.tracks):
-            for photo, keypoint in track:
-                found[photo][keypoint] = row
+        found = {}
+        for number, count in counts.items():
+            mine = self.of(number)
+            found[number] = np.full(count, -1, np.int64)
+            found[number][self.keypoint[mine]] = self.row[mine]
         return found
+
+    def structure(self) -> Structure:
+        """Return the points with their tracks."""
+        tracks: list[Track] = [[] for _ in self.ids]
+        listed = zip(self.photo.tolist(), self.keypoint.tolist(), strict=True)
+        for row, element in zip(self.row.tolist(), listed, strict=True):
+            tracks[row].append(element)
+        return Structure(self.points, tracks)
+
+
+def read_observations(model: pycolmap.Reconstruction, photos: Collection[int] | None = None) -> Observations:
+    """Return the observations of some placed photos, or of all, and the points that they observe.
+
+    They are read photo by photo: reading them point by point takes three times as long.
+    """
+    images = [model.images[number] for number in sorted(model.reg_image_ids() if photos is None else photos)]
+    seen = [observed_points(image) for image in images]
+    photo = np.repeat(np.array([image.image_id for image in images], np.int64), [len(ids) for _, ids in seen])
+    keypoint = np.concatenate([np.zeros(0, np.int64), *(keypoints for keypoints, _ in seen)])
+    observed = np.concatenate([np.zeros(0, np.int64), *(ids for _, ids in seen)])
+    ids, first, which = np.unique(observed, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    points = model.points3D
+    places = np.array([points[number].xyz for number in ids[order].tolist()], np.float64).reshape(-1, 3)
+    return Observations(photo, keypoint, np.argsort(order)[which], ids[order], places)
+
+
+def observed_points(image: pycolmap.Image) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+    """Return the keypoints of a photo that observe a point, ascending, and the ids of these points."""
+    ids = np.array([seen.point3D_id for seen in image.get_observation_points2D()], np.int64)
+    return np.array(image.get_observation_point2D_idxs(), np.int64), ids
 
 
 def read_structure(model: pycolmap.Reconstruction) -> Structure:
-    """Return the points and tracks of a model.
-
-    Observations are read photo by photo: reading them point by point takes three times as long.
-    """
-    images = [model.images[number] for number in sorted(model.reg_image_ids())]
-    keypoints = [image.get_observation_point2D_idxs() for image in images]
-    ids = np.array([seen.point3D_id for image in images for seen in image.get_observation_points2D()], np.int64)
-    numbers, first, which = np.unique(ids, return_index=True, return_inverse=True)
-    order = np.argsort(first)  # by the first observation, which no two tracks share: sorted by track
-    rows = np.argsort(order)[which]
-    listed = ((image.image_id, keypoint) for image, seen in zip(images, keypoints, strict=True) for keypoint in seen)
-    tracks: list[Track] = [[] for _ in numbers]
-    for row, element in zip(rows.tolist(), listed, strict=True):
-        tracks[row].append(element)
-    points = model.points3D
-    places = [points[number].xyz for number in numbers[order].tolist()]
-    return Structure(np.array(places, np.float64).reshape(-1, 3), tracks)
+    """Return the points and tracks of a model."""
+    return read_observations(model).structure()
 
 
 def make_model(
@@ -101,14 +141,14 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
     return {number: model.cameras[number] for number in sorted(used)}
 
 
-def without(model: pycolmap.Reconstruction, verified: ViewGraph, photos: Collection[int]) -> pycolmap.Reconstruction:
+def without(model: pycolmap.Reconstruction, photos: Collection[int]) -> pycolmap.Reconstruction:
     """Return the model without some photos and without the points that fewer than two other photos observe."""
-    structure = read_structure(model)
-    tracks = [[element for element in track if element[0] not in photos] for track in structure.tracks]
-    poses = {number: pose for number, pose in poses_of(model).items() if number not in photos}
-    used = {verified.camera_of[number] for number in poses}
-    cameras = [camera for number, camera in cameras_of(model).items() if number in used]
-    return make_model(cameras, poses, verified, Structure(structure.points, tracks))
+    left = pycolmap.Reconstruction(model)
+    observations = pycolmap.ObservationManager(left)
+    for number in sorted(photos):
+        observations.deregister_frame(left.images[number].frame_id)
+    left.tear_down()
+    return left
 
 
 def loosely_tied(model: pycolmap.Reconstruction) -> set[int]:

@@ -25,10 +25,11 @@ from splatpipe.pipeline.sfm.mapping.mapping import MappingOptions, incremental_o
 from splatpipe.pipeline.sfm.matching.matching import look_alike
 from splatpipe.pipeline.sfm.model.pixel_tolerance_scale import pixel_tolerance_scale
 from splatpipe.pipeline.sfm.model.structure import (
-    Structure,
+    Observations,
     cameras_of,
     make_model,
     poses_of,
+    read_observations,
     read_structure,
     without,
 )
@@ -240,12 +241,9 @@ def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
     model, added = found.model, set[int]()
     for _ in range(ROUNDS):
         left = [number for number in unplaced(found) if number not in added]
-        structure = read_structure(model)
-        placements = _placements(work, found.verified, model, structure, left)
-        if placements:
-            model = _extended(model, found.verified, structure, placements)
-        else:
-            model = pycolmap.Reconstruction(model)
+        seen = read_observations(model, _partners(found.verified, left).intersection(model.reg_image_ids()))
+        placements = _placements(work, found.verified, model, seen, left)
+        model = _extended(model, found.verified, seen, placements)
         growth = work.mapper(found.database, model)
         growth.triangulate(sorted(placements))
         fresh = sorted(placements) or growth.place_by_pairs(left)
@@ -259,11 +257,16 @@ def _registered(work: LadderContext, found: MappingResult) -> MappingResult:
     return _adjusted(work, found, model, added)
 
 
+def _partners(verified: ViewGraph, photos: Collection[int]) -> set[int]:
+    """Return the photos that have matches with some."""
+    asked = set(photos)
+    return {number for pair in verified.matches if not asked.isdisjoint(pair) for number in pair}
+
+
 def _placements(
-    work: LadderContext, verified: ViewGraph, model: Model, structure: Structure, left: Collection[int]
+    work: LadderContext, verified: ViewGraph, model: Model, seen: Observations, left: Collection[int]
 ) -> dict[int, PoseEstimate]:
-    counts = {number: len(verified.keypoints[number]) for number in model.reg_image_ids()}
-    rows = structure.rows(counts)
+    rows = seen.rows({number: len(verified.keypoints[number]) for number in np.unique(seen.photo).tolist()})
     cameras = cameras_of(model)
     placements = {}
     for done, number in enumerate(sorted(left)):
@@ -272,7 +275,7 @@ def _placements(
         placement = place(
             sightings(verified, rows, number),
             verified.keypoints[number],
-            structure.points,
+            seen.points,
             cameras.get(camera, verified.cameras[camera]),
             camera in cameras,
             work.options.seed,
@@ -282,18 +285,18 @@ def _placements(
     return placements
 
 
-def _extended(model: Model, verified: ViewGraph, structure: Structure, placements: Mapping[int, PoseEstimate]) -> Model:
-    """Return the model with more photos and their observations of its points."""
-    tracks = [list(track) for track in structure.tracks]
-    cameras = cameras_of(model)
-    poses = poses_of(model)
+def _extended(model: Model, verified: ViewGraph, seen: Observations, placements: Mapping[int, PoseEstimate]) -> Model:
+    """Return a copy of the model with more photos and their observations of its points."""
+    grown = pycolmap.Reconstruction(model)
     for number, placement in sorted(placements.items()):
-        poses[number] = placement.pose
-        cameras.setdefault(verified.camera_of[number], placement.camera)
+        camera = verified.camera_of[number]
+        if not grown.exists_camera(camera):
+            grown.add_camera_with_trivial_rig(placement.camera)
+        image = pycolmap.Image(verified.names[number], verified.keypoints[number].astype(np.float64), camera, number)
+        grown.add_image_with_trivial_frame(image, placement.pose)
         for keypoint, row in placement.observations:
-            tracks[row].append((number, keypoint))
-    ordered = Structure(structure.points, [sorted(track) for track in tracks])
-    return make_model(cameras.values(), poses, verified, ordered)
+            grown.add_observation(int(seen.ids[row]), pycolmap.TrackElement(number, keypoint))
+    return grown
 
 
 def _joined(work: LadderContext, found: MappingResult) -> MappingResult:
@@ -349,7 +352,7 @@ def _adjusted(
         kept = [number for number in kept if number not in bad]
         if not kept:
             return found
-        model = without(model, found.verified, bad)
+        model = without(model, bad)
     after, placed = sum(observations(model, old).values()), set(model.reg_image_ids())
     limit = max(WORSE_ERROR * error, error + WORSE_ERROR_PX)
     if not placed.issuperset(old) or after < KEPT_OBSERVATIONS * before or mean_error_px(model) > limit:

@@ -14,7 +14,15 @@ import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 from splatpipe.pipeline.geometry.similarity import Similarity, fit_similarity
-from splatpipe.pipeline.sfm.model.structure import Structure, Track, cameras_of, make_model, poses_of, read_structure
+from splatpipe.pipeline.sfm.model.structure import (
+    Observations,
+    Structure,
+    Track,
+    cameras_of,
+    make_model,
+    poses_of,
+    read_observations,
+)
 from splatpipe.pipeline.sfm.model.view_graph import ViewGraph
 from splatpipe.pipeline.sfm.recovery.ladder_poses import (
     CELLS,
@@ -83,7 +91,7 @@ def join(
         verified: The view graph; keypoints may have been added since.
         seed: For RANSAC.
     """
-    here, there = read_structure(model), read_structure(other)
+    here, there = read_observations(model), read_observations(other)
     ties = find_ties(model, here, other, there, verified)
     fitted = fit_ties(ties, np.ones(len(ties), bool), seed)
     if fitted is None:
@@ -91,14 +99,14 @@ def join(
     similarity, inliers = fitted
     if not _is_certain(ties, inliers) or not _cross_validates(ties, seed):
         return None
-    return _united(model, here, other, there, verified, similarity, ties.rows[inliers])
+    return _united(model, here.structure(), other, there.structure(), verified, similarity, ties.rows[inliers])
 
 
 def find_ties(
     model: pycolmap.Reconstruction,
-    here: Structure,
+    here: Observations,
     other: pycolmap.Reconstruction,
-    there: Structure,
+    there: Observations,
     verified: ViewGraph,
 ) -> TiePoints:
     """Return the ties given by verified matches between photos of both models, and by photos that are in both."""
@@ -121,16 +129,16 @@ def find_ties(
 
 def _tied(
     model: pycolmap.Reconstruction,
-    here: Structure,
+    here: Observations,
     other: pycolmap.Reconstruction,
-    there: Structure,
+    there: Observations,
     verified: ViewGraph,
     found: Mapping[tuple[int, int], tuple[int, int, int, int]],
 ) -> TiePoints:
     rows = np.array(sorted(found), np.int64).reshape(-1, 2)
     seen = np.array([found[int(a), int(b)] for a, b in rows], np.int64).reshape(-1, 4)
     sides = []
-    for side, (of, structure) in enumerate(((model, here), (other, there))):
+    for side, (of, observed) in enumerate(((model, here), (other, there))):
         photos, keypoints = seen[:, side], seen[:, 2 + side]
         poses, places = np.zeros((len(rows), 3, 4)), np.zeros((len(rows), 2))
         pixels, limits, cells = np.zeros(len(rows)), np.zeros(len(rows)), np.zeros(len(rows), np.int64)
@@ -144,7 +152,7 @@ def _tied(
             limits[mine] = TOLERANCE_FACTOR * max(MIN_ERROR_PX, MAX_ERROR_SHARE * max(camera.width, camera.height))
             part = np.clip((spots / [camera.width, camera.height] * CELLS).astype(int), 0, CELLS - 1)
             cells[mine] = part[:, 0] * CELLS + part[:, 1]
-        sides.append((structure.points[rows[:, side]], poses, places, pixels, limits, cells))
+        sides.append((observed.points[rows[:, side]], poses, places, pixels, limits, cells))
     points, poses_, places_, pixels_, limits_, cells_ = zip(*sides, strict=True)
     return TiePoints(rows, seen[:, :2], points, poses_, places_, pixels_, limits_, cells_[0])
 

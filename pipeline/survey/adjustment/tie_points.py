@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
+from splatpipe.pipeline.geometry.meeting_rays import ray_equations
 from splatpipe.pipeline.geometry.similarity import Similarity
 from splatpipe.pipeline.sfm.lenses.lens_model import NAMES, is_known, narrow, set_lens, widen
 from splatpipe.pipeline.sfm.mapping.retriangulation import MAX_ERROR_PX
@@ -171,15 +172,11 @@ def intersected(block: Block) -> Block:
     rays = np.where(sound[:, None], rays, 1.0)
     ways = np.einsum("mji,mj->mi", block.rotations[block.photo], rays)
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    across = sound[:, None, None] * (np.eye(3) - ways[:, :, None] * ways[:, None, :])
-    p = len(block.points)
-    whole, side = np.zeros((p, 3, 3)), np.zeros((p, 3))
-    np.add.at(whole, block.point, across)
-    np.add.at(side, block.point, np.einsum("mij,mj->mi", across, block.centres[block.photo]))
-    values = np.linalg.eigvalsh(whole)
-    meet = values[:, 0] > MIN_EIGENVALUE_RATIO * np.maximum(values[:, 2], 1e-300)
-    points = block.points.copy()
-    points[meet] = np.linalg.solve(whole[meet], side[meet][:, :, None])[:, :, 0]
+    equations = ray_equations(
+        block.point, len(block.points), block.centres[block.photo], ways, sound.astype(np.float64)
+    )
+    points, meet = equations.solved(MIN_EIGENVALUE_RATIO)
+    points[~meet] = block.points[~meet]
     return settle_points(replace(block, points=points), TRIANGULATION_ROUNDS)
 
 

@@ -102,7 +102,7 @@ def found_without(
 ) -> MappingResult:
     """A model that lacks photos, on the view graph of a capture."""
     verified = read_verified(capture.database)
-    model = without(whole[0], verified, left)
+    model = without(whole[0], left)
     assert model.num_reg_images() == COUNT - len(left)
     return MappingResult(model, (), capture.database, verified, capture.colours, **more)
 
@@ -165,14 +165,14 @@ def test_sub_models_are_joined_by_common_points(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:
     model, verified = whole
-    first, second = without(model, verified, {5, 6, 7, 8}), without(model, verified, {1, 2, 3})
+    first, second = without(model, {5, 6, 7, 8}), without(model, {1, 2, 3})
     turn = pycolmap.Rotation3d(np.array([0.5, -0.5, 0.5, 0.5]))
     second.transform(pycolmap.Sim3d(2.5, turn, np.array([3.0, -7.0, 11.0])))
     united = join(first, second, verified, seed=0)
     assert united is not None
     assert united.num_reg_images() == COUNT
     assert max(centre_errors(united).values()) < 0.01
-    apart = without(model, verified, {1, 2, 3, 4})
+    apart = without(model, {1, 2, 3, 4})
     apart.transform(pycolmap.Sim3d(0.4, turn, np.array([3.0, -7.0, 11.0])))
     found = run_ladder(
         room,
@@ -188,7 +188,7 @@ def test_models_that_share_nothing_but_chance_stay_apart(
     whole: tuple[pycolmap.Reconstruction, ViewGraph],
 ) -> None:
     model, verified = whole
-    first, second = without(model, verified, {5, 6, 7, 8}), without(model, verified, {1, 2, 3, 4})
+    first, second = without(model, {5, 6, 7, 8}), without(model, {1, 2, 3, 4})
     generator = np.random.default_rng(0)
     shuffled = {
         (i, j): np.column_stack([rows[:, 0], generator.permutation(rows[:, 1])]) if i <= 4 < j else rows

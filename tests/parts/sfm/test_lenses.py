@@ -9,9 +9,11 @@ from lens_scene import HEIGHT, WIDTH, LensScene, make_lens, make_scene, orbit, s
 
 from splatpipe.pipeline.engine.stage import JSON
 from splatpipe.pipeline.sfm.lenses import focal, lens_trial
+from splatpipe.pipeline.sfm.lenses.carried_over import carry_over
 from splatpipe.pipeline.sfm.lenses.focal import focal_sigmas
 from splatpipe.pipeline.sfm.lenses.lens_model import StatedLens, apart_px, named_params, narrow, simplest, widen
 from splatpipe.pipeline.sfm.lenses.lenses import calibrate
+from splatpipe.pipeline.sfm.model.structure import without
 
 SIMPLE = (850.0, WIDTH / 2, HEIGHT / 2, -0.05)
 # The P1's distortion (its profile in Pix4D's database) on this wider lens, doubled; the principal point 20 pixels off.
@@ -42,6 +44,23 @@ def test_a_brown_lens_is_found(scene: LensScene, calibrated: Calibrated) -> None
     assert rms(apart_px(found.cameras[1], scene.lenses[1], turn=True)) < 0.3
     assert "cx cy" in rows[0]["freed"]
     assert found.compute_mean_reprojection_error() < scene.model.compute_mean_reprojection_error()
+
+
+@pytest.mark.parametrize("left", [set(), {3, 17}], ids=["all photos tried", "two photos left out"])
+def test_lenses_that_are_carried_over_leave_little_to_adjust(
+    scene: LensScene, calibrated: Calibrated, left: set[int]
+) -> None:
+    """Nearly as close as adjusted, although points and photos of the trial's simple lens are pixels off."""
+    adjusted = calibrated[0]
+    lensed = without(adjusted, left)
+    carried = carry_over(scene.model, lensed, scene.verified)
+    carried.update_point_3d_errors()
+    assert carried.num_reg_images() == scene.model.num_reg_images()
+    assert carried.compute_mean_reprojection_error() < 1.05 * adjusted.compute_mean_reprojection_error()
+    for number in left:
+        there, here = (model.images[number].projection_center() for model in (adjusted, carried))
+        before = scene.model.images[number].projection_center()
+        assert np.linalg.norm(here - there) < 0.2 * np.linalg.norm(before - there)
 
 
 @pytest.mark.parametrize("seed", range(5))

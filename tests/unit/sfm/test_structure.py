@@ -14,6 +14,7 @@ from splatpipe.pipeline.sfm.model.structure import (
     loosely_tied,
     make_model,
     poses_of,
+    read_observations,
     read_structure,
     without,
 )
@@ -62,7 +63,25 @@ def test_two_photos_alone_are_not_loose(ring: Ring) -> None:
 
 
 def test_a_photo_that_was_dropped_is_in_no_track_and_observes_nothing(ring: Ring) -> None:
-    smaller = without(with_tracks(ring, [(1, 2, 3), (2, 3, 4), (4, 5)]), ring.verified, {5})
+    smaller = without(with_tracks(ring, [(1, 2, 3), (2, 3, 4), (4, 5)]), {5})
     assert sorted(smaller.reg_image_ids()) == [1, 2, 3, 4]
     assert smaller.num_points3D() == 2  # what 4 alone observes is no point
     assert observations(smaller, [1, 2, 3, 4, 5]) == {1: 1, 2: 2, 3: 2, 4: 1, 5: 0}
+
+
+def test_observations_name_the_point_of_every_keypoint(ring: Ring) -> None:
+    model = with_tracks(ring, [(1, 2, 3), (2, 3, 4), (1, 4)])
+    found = read_observations(model)
+    assert found.structure().tracks == sorted(found.structure().tracks)
+    rows = found.rows(dict.fromkeys((1, 2, 3, 4), 6))
+    assert rows[1].tolist() == [0, 1, -1, -1, -1, -1]  # points in the order of their tracks
+    assert rows[2].tolist() == [0, 2, -1, -1, -1, -1]
+    for photo, keypoint, row in zip(found.photo.tolist(), found.keypoint.tolist(), found.row.tolist(), strict=True):
+        assert model.images[photo].points2D[keypoint].point3D_id == found.ids[row]
+
+
+def test_observations_of_some_photos_leave_out_what_only_others_observe(ring: Ring) -> None:
+    model = with_tracks(ring, [(1, 2, 3), (2, 3, 4), (1, 4), (3, 4)])
+    found = read_observations(model, {1})
+    assert set(found.photo.tolist()) == {1} and len(found.ids) == len(found.points) == 2
+    assert len(read_observations(model, ()).ids) == 0
