@@ -28,7 +28,7 @@ class RayEquations:
         """Return the points, and the mask of those that their rays determine; the others are zeros.
 
         Args:
-            least_ratio: Least ratio of a point's eigenvalues, about half the square of the rays' angle.
+            least_ratio: Least ratio of a point's eigenvalues, of two rays about a quarter of the square of their angle.
         """
         values = np.linalg.eigvalsh(self.whole)
         meet = np.asarray(values[:, 0] > least_ratio * np.maximum(values[:, 2], 1e-300))
@@ -62,6 +62,7 @@ def _summed(
     rows: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n ..."], count: int
 ) -> Float64[np.ndarray, "m ..."]:
     """Return the sums of the values of each row; ``np.add.at`` of blocks takes several times as long."""
-    columns = values.reshape(len(values), -1).T
-    sums = np.stack([np.bincount(rows, column, count) for column in columns], axis=1)
-    return np.asarray(sums.reshape(count, *values.shape[1:]))
+    sums = np.zeros((count, *values.shape[1:]))
+    for place in np.ndindex(values.shape[1:]):
+        sums[:, *place] = np.bincount(rows, values[:, *place], count)
+    return sums

@@ -117,18 +117,15 @@ def report_cameras(rows: Sequence[Mapping[str, JSON]], report: Reporter) -> None
 
 def _errors_px(model: pycolmap.Reconstruction, verified: ViewGraph) -> dict[int, float]:
     """Return the mean reprojection error of each camera's observations, pixels."""
-    result = {}
     seen = read_observations(model)
-    for number in sorted(model.cameras):
-        camera, total, count = model.cameras[number], 0.0, 0
-        for image in (model.images[i] for i in sorted(model.reg_image_ids())):
-            mine = seen.of(image.image_id)
-            if image.camera_id == number and mine.start < mine.stop:
-                pose = np.asarray(image.cam_from_world().matrix(), np.float64)
-                projected, _ = project_through_lens(camera, pose, seen.points[seen.row[mine]])
-                places = verified.keypoints[image.image_id][seen.keypoint[mine]].astype(np.float64)
-                off = np.linalg.norm(projected - places, axis=1)
-                total, count = total + float(off[np.isfinite(off)].sum()), count + int(np.isfinite(off).sum())
-        if count and math.isfinite(total):
-            result[number] = round(total / count, 4)
-    return result
+    totals, counts = dict.fromkeys(sorted(model.cameras), 0.0), Counter[int]()
+    for image in (model.images[number] for number in sorted(model.reg_image_ids())):
+        mine = seen.of(image.image_id)
+        pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+        projected, _ = project_through_lens(image.camera, pose, seen.points[seen.row[mine]])
+        off = np.linalg.norm(projected - verified.keypoints[image.image_id][seen.keypoint[mine]], axis=1)
+        sound = np.isfinite(off)
+        totals[image.camera_id] += float(off[sound].sum())
+        counts[image.camera_id] += int(sound.sum())
+    known = [number for number, total in totals.items() if counts[number] and math.isfinite(total)]
+    return {number: round(totals[number] / counts[number], 4) for number in known}

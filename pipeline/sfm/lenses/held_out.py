@@ -28,7 +28,7 @@ class TrackObservations:
     """Observations of tracks, track after track.
 
     Attributes:
-        track: Track number of each observation, from 0, ascending.
+        track: Track number of each observation, from 0; ascending for ``predicted_errors``.
         image: COLMAP's image id of each observation.
         pixels: Image coordinates of each observation, pixels.
     """
@@ -70,7 +70,7 @@ def predicted_errors(model: pycolmap.Reconstruction, tracks: TrackObservations) 
     """
     rotations, centres, rays = world_rays(model, tracks)
     count = int(tracks.track[-1]) + 1 if len(tracks.track) else 0
-    weights = np.ones(len(rays))
+    weights = np.any(rays, axis=1).astype(np.float64)
     predicted = np.zeros((len(rays), 3))
     for _ in range(REWEIGHTINGS):
         equations = ray_equations(tracks.track, count, centres, rays, weights)
@@ -143,9 +143,13 @@ def rows_by_camera(
 def world_rays(
     model: pycolmap.Reconstruction, tracks: TrackObservations
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Return for each observation the photo's rotation, its centre, and the unit ray in the model's frame."""
+    """Return for each observation the photo's rotation, its centre, and the unit ray in the model's frame.
+
+    Rays that a lens cannot invert are zeros.
+    """
     numbers, which = np.unique(tracks.image, return_inverse=True)
-    poses = np.stack([model.images[number].cam_from_world().matrix() for number in numbers.tolist()])
+    matrices = [model.images[number].cam_from_world().matrix() for number in numbers.tolist()]
+    poses = np.array(matrices, np.float64).reshape(-1, 3, 4)
     turns = poses[:, :, :3]
     centres = -np.einsum("nji,nj->ni", turns, poses[:, :, 3])
     flat = np.full((len(tracks.track), 3), 1.0)

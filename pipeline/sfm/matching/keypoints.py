@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,21 +93,26 @@ def extract(
         return Features(np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.uint8))
     small = reduced(pixels, config.max_image_size)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    scale = np.array([pixels.shape[1] / grey.shape[1], pixels.shape[0] / grey.shape[0]])
+
+    def unmasked(keypoints: Floats) -> npt.NDArray[np.int64]:
+        rows = np.arange(len(keypoints))
+        return rows if mask is None else rows[_pixels_at(mask, keypoints[:, :2] * scale) > 0]
+
+    def kept(keypoints: Floats) -> npt.NDArray[np.int64]:
+        rows = unmasked(keypoints)
+        return rows[largest(keypoints[rows], config.max_features)]
+
     if config.extractor == "opencv-sift":
-        keypoints, descriptors = opencv_sift(grey, contrast)
+        keypoints, descriptors = opencv_sift(grey, kept, contrast)
     else:
         keypoints, descriptors = colmap_sift(grey, math.ceil(config.max_features / share), scratch)
-    scale = np.array([pixels.shape[1] / grey.shape[1], pixels.shape[0] / grey.shape[0]])
-    rows = np.arange(len(keypoints))
-    if mask is not None:
-        rows = rows[_pixels_at(mask, keypoints[:, :2] * scale) > 0]
-    if config.extractor == "opencv-sift":
-        rows = rows[largest(keypoints[rows], config.max_features)]
-    colours = _pixels_at(small, keypoints[rows, :2])
-    full = keypoints[rows].astype(np.float64)
+        rows = unmasked(keypoints)
+        keypoints, descriptors = keypoints[rows], np.ascontiguousarray(descriptors[rows])
+    full = keypoints.astype(np.float64)
     full[:, :2] *= scale
     full[:, 2:] *= scale.mean()
-    return Features(full.astype(np.float32), np.ascontiguousarray(descriptors[rows]), colours)
+    return Features(full.astype(np.float32), descriptors, _pixels_at(small, keypoints[:, :2]))
 
 
 def largest(keypoints: Floats, places: int) -> npt.NDArray[np.int64]:
@@ -163,28 +168,43 @@ def colmap_sift(grey: Bytes, limit: int, scratch: Path) -> tuple[Floats, Bytes]:
     return keypoints, descriptors
 
 
-def opencv_sift(grey: Bytes, contrast: float = CONTRAST) -> tuple[Floats, Bytes]:
+def opencv_sift(
+    grey: Bytes, kept: Callable[[Floats], npt.NDArray[np.int64]], contrast: float = CONTRAST
+) -> tuple[Floats, Bytes]:
     """Run OpenCV's SIFT with square-rooted descriptors (RootSIFT; Arandjelović and Zisserman, CVPR 2012).
 
-    All keypoints are returned: OpenCV's own limit keeps the strongest responses, which costs half the matches.
+    OpenCV's own limit keeps the strongest responses, which costs half the matches.
 
     Args:
         grey: (h, w).
+        kept: Chooses rows of the (n, 6) keypoints.
         contrast: The least contrast of a keypoint; fainter ones are noise, or the texture of what has little.
 
     Returns:
-        As ``colmap_sift``.
+        As ``colmap_sift``, of the chosen keypoints.
     """
     # Without precise upscaling every keypoint is a quarter of a pixel off.
     detector = cv2.SIFT_create(contrastThreshold=contrast, enable_precise_upscale=True)
-    found, values = detector.detectAndCompute(grey, None)
-    if values is None or len(found) == 0:
+    # Of faint keypoints most are left out: describing them all costs more than the scale space once more.
+    at_once = contrast >= CONTRAST
+    found, values = detector.detectAndCompute(grey, None) if at_once else (detector.detect(grey, None), None)
+    keypoints = _keypoints_of(found)
+    rows = kept(keypoints)
+    if not at_once and len(rows):
+        _, values = detector.compute(grey, [found[row] for row in rows.tolist()])
+    elif values is not None:
+        values = values[rows]
+    if values is None or len(rows) == 0:
         return np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8)
-    place = np.array([keypoint.pt for keypoint in found], np.float64) + 0.5
+    sums = np.maximum(values.sum(axis=1, keepdims=True, dtype=np.float64), 1e-12)
+    rooted = np.rint(DESCRIPTOR_NORM * np.sqrt(values / sums))
+    return keypoints[rows], np.minimum(rooted, 255).astype(np.uint8)
+
+
+def _keypoints_of(found: Sequence[cv2.KeyPoint]) -> Floats:
+    """OpenCV's keypoints as in ``Features``, in pixels of the image."""
+    place = np.array([keypoint.pt for keypoint in found], np.float64).reshape(-1, 2) + 0.5
     radius = np.array([keypoint.size / 2 for keypoint in found])
     angle = np.radians([keypoint.angle for keypoint in found])
     cos, sin = radius * np.cos(angle), radius * np.sin(angle)
-    keypoints = np.column_stack([place, cos, -sin, sin, cos]).astype(np.float32)
-    sums = np.maximum(values.sum(axis=1, keepdims=True, dtype=np.float64), 1e-12)
-    rooted = np.rint(DESCRIPTOR_NORM * np.sqrt(values / sums))
-    return keypoints, np.minimum(rooted, 255).astype(np.uint8)
+    return np.column_stack([place, cos, -sin, sin, cos]).astype(np.float32)

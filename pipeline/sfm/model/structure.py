@@ -30,7 +30,7 @@ class Structure:
 
 @dataclass(frozen=True)
 class Observations:
-    """The points of a model and all observations of them, photo by photo.
+    """Points of a model, and the observations of them by all photos or by some, photo by photo.
 
     Attributes:
         photo: COLMAP's number of the photo of each observation, ascending.
@@ -145,9 +145,10 @@ def without(model: pycolmap.Reconstruction, photos: Collection[int]) -> pycolmap
     """Return the model without some photos and without the points that fewer than two other photos observe."""
     left = pycolmap.Reconstruction(model)
     observations = pycolmap.ObservationManager(left)
-    for number in sorted(photos):
+    for number in sorted(set(photos).intersection(left.reg_image_ids())):  # an adjustment may have dropped some
         observations.deregister_frame(left.images[number].frame_id)
     left.tear_down()
+    left.update_point_3d_errors()
     return left
 
 

@@ -288,6 +288,7 @@ def _placements(
 def _extended(model: Model, verified: ViewGraph, seen: Observations, placements: Mapping[int, PoseEstimate]) -> Model:
     """Return a copy of the model with more photos and their observations of its points."""
     grown = pycolmap.Reconstruction(model)
+    grown.tear_down()  # COLMAP's global mapper leaves photos and cameras in it that are not placed
     for number, placement in sorted(placements.items()):
         camera = verified.camera_of[number]
         if not grown.exists_camera(camera):

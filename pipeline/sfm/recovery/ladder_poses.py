@@ -69,7 +69,7 @@ def sightings(verified: ViewGraph, rows: Mapping[int, Int64[np.ndarray, " _"]], 
 
     Args:
         verified: The view graph.
-        rows: For each placed photo, the point row of each keypoint, or -1.
+        rows: For each placed photo that matches it, the point row of each keypoint, or -1.
         number: The photo.
     """
     found: dict[tuple[int, int], int] = {}

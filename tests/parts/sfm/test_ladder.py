@@ -138,6 +138,18 @@ def test_photos_are_registered_to_the_finished_model(
     assert found.model.num_points3D() > 0.9 * whole[0].num_points3D()
 
 
+def test_photos_that_a_model_has_without_a_pose_are_registered(
+    room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
+) -> None:
+    """As COLMAP's global mapper leaves them."""
+    model = pycolmap.Reconstruction(whole[0])
+    for number in (1, 5):
+        pycolmap.ObservationManager(model).deregister_frame(model.images[number].frame_id)
+    assert model.exists_image(5) and model.num_reg_images() == COUNT - 2
+    found = replace(found_without(room, whole, {1, 5}), model=model)
+    assert_all_right(run_ladder(room, found, SparseConfig(), corner_photos.Recorder()), "registration")
+
+
 def test_a_photo_without_pairs_gets_new_ones(
     room: MappingInput, whole: tuple[pycolmap.Reconstruction, ViewGraph]
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -61,6 +63,17 @@ def test_lenses_that_are_carried_over_leave_little_to_adjust(
         there, here = (model.images[number].projection_center() for model in (adjusted, carried))
         before = scene.model.images[number].projection_center()
         assert np.linalg.norm(here - there) < 0.2 * np.linalg.norm(before - there)
+
+
+def test_rays_that_a_lens_cannot_invert_move_no_point(scene: LensScene, calibrated: Calibrated) -> None:
+    adjusted = calibrated[0]
+    keypoints = {number: places.copy() for number, places in scene.verified.keypoints.items()}
+    keypoints[5][:] = np.nan
+    expected = carry_over(scene.model, without(adjusted, {5}), scene.verified)
+    found = carry_over(scene.model, adjusted, replace(scene.verified, keypoints=keypoints))
+    places = {number: point.xyz for number, point in expected.points3D.items()}
+    apart = [np.linalg.norm(point.xyz - places[number]) for number, point in found.points3D.items()]
+    assert np.isfinite(apart).all() and np.median(apart) < 0.01
 
 
 @pytest.mark.parametrize("seed", range(5))

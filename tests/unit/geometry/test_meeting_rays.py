@@ -38,3 +38,9 @@ def test_rays_that_do_not_meet_determine_no_point(ways: list[list[float]]) -> No
         RATIO
     )
     assert not meet.any() and not found.any()
+
+
+def test_no_rays_determine_no_points() -> None:
+    none = np.zeros((0, 3))
+    found, meet = ray_equations(np.zeros(0, np.int64), 2, none, none, np.zeros(0)).solved(RATIO)
+    assert found.shape == (2, 3) and not meet.any()

@@ -63,7 +63,7 @@ def test_two_photos_alone_are_not_loose(ring: Ring) -> None:
 
 
 def test_a_photo_that_was_dropped_is_in_no_track_and_observes_nothing(ring: Ring) -> None:
-    smaller = without(with_tracks(ring, [(1, 2, 3), (2, 3, 4), (4, 5)]), {5})
+    smaller = without(with_tracks(ring, [(1, 2, 3), (2, 3, 4), (4, 5)]), {5, 6})  # 6 was dropped before
     assert sorted(smaller.reg_image_ids()) == [1, 2, 3, 4]
     assert smaller.num_points3D() == 2  # what 4 alone observes is no point
     assert observations(smaller, [1, 2, 3, 4, 5]) == {1: 1, 2: 2, 3: 2, 4: 1, 5: 0}
