@@ -71,9 +71,8 @@ def _meeting_points(
     """Return where the rays from some photos meet, and the mask of points for which they do, before all cameras."""
     chosen = np.isin(seen.photo, sorted(photos))
     photo, row = seen.photo[chosen], seen.row[chosen]
-    pixels = np.zeros((len(photo), 2))
-    for number in sorted(photos):
-        pixels[photo == number] = verified.keypoints[number][seen.keypoint[seen.of(number)]]
+    listed = [verified.keypoints[number][seen.keypoint[seen.of(number)]] for number in sorted(photos)]
+    pixels = np.concatenate([np.zeros((0, 2)), *listed])
     _, centres, rays = world_rays(model, TrackObservations(row, photo, pixels))
     sound = np.any(rays, axis=1)  # where the lens's distortion cannot be inverted, there is no ray
     weights = sound.astype(np.float64)
