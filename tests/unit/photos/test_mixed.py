@@ -103,9 +103,11 @@ def two_cameras(alone: float) -> tuple[pycolmap.Reconstruction, ViewGraph, list[
     half.params = [LENS[0] / 2 * alone, LENS[1] / 2, LENS[2] / 2, LENS[3]]
     model.add_camera_with_trivial_rig(half)
     numbers = sorted(source.reg_image_ids())
+    keypoints = {}
     for number in numbers:
         old, last = source.images[number], number == numbers[-1]
         places = np.array([point.xy for point in old.points2D]) * (0.5 if last else 1.0)
+        keypoints[number] = places.astype(np.float32)
         model.add_image_with_trivial_frame(
             pycolmap.Image(old.name, places, 2 if last else 1, number), old.cam_from_world()
         )
@@ -120,7 +122,7 @@ def two_cameras(alone: float) -> tuple[pycolmap.Reconstruction, ViewGraph, list[
     names = {number: TRUTH["photos"][number - 1]["name"] for number in numbers}
     body = {"make": "DJI", "model_name": "FC330", "focal_source": "sensor-table"}
     groups = [body | {"width": WIDTH // k, "height": HEIGHT // k, "focal_px": LENS[0] / 1.03 / k} for k in (1, 2)]
-    return model, ViewGraph(names, camera_of, priors, {}, {}), groups
+    return model, ViewGraph(names, camera_of, priors, keypoints, {}), groups
 
 
 def test_a_single_photos_focal_length_is_that_of_its_body() -> None:
