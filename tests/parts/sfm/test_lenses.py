@@ -73,7 +73,7 @@ def test_rays_that_a_lens_cannot_invert_move_no_point(scene: LensScene, calibrat
     found = carry_over(scene.model, adjusted, replace(scene.verified, keypoints=keypoints))
     places = {number: point.xyz for number, point in expected.points3D.items()}
     apart = [np.linalg.norm(point.xyz - places[number]) for number, point in found.points3D.items()]
-    assert np.isfinite(apart).all() and np.median(apart) < 0.01
+    assert max(apart) < 0.1  # 0.28 if such rays counted
 
 
 @pytest.mark.parametrize("seed", range(5))
